@@ -166,7 +166,12 @@ class Connection:
     # -- state ---------------------------------------------------------------------------------------------
 
     def publisher(
-        self, source: str, coordinates: Iterable[Symbol | str], *, offset: float = 0.0
+        self,
+        source: str,
+        coordinates: Iterable[Symbol | str],
+        *,
+        offset: float = 0.0,
+        answer: Callable[[bytes], bytes] | None = None,
     ) -> StatePublisher:
         """Return a new source of state, which the readers of all clients find. It ends with this connection.
 
@@ -185,6 +190,7 @@ class Connection:
             direct=not self.address.endpoint,
             announce=self._announce,
             offset=seconds,
+            answer=answer,
         )
         self._publishers.append(publisher)
         try:

@@ -1,7 +1,8 @@
 """State beside the model: vectors of values that sources send and readers merge, without a server's work.
 
 A source has a layout, the coordinates of its vectors. A message is a header, with the digest of the layout,
-and the values as doubles. Readers know layouts from the server's list of sources, or ask the source for them.
+the values as doubles, and a note: bytes for what is no number. Readers know layouts from the server's list of
+sources, or ask the source for them.
 On the server's computer a source listens at a socket of its own, ``NAME@SOURCE.sock`` beside the server's, so
 its stream goes on when the server ends. Everybody else sends and reads through the server, and waits for it.
 """
@@ -17,6 +18,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import product
 from typing import Final, NamedTuple
 
 import msgspec
@@ -69,6 +71,9 @@ class StatePublisher(Closing):
         when it is closed.
     offset
         What is to be added to its stamps to get the time of the server [s].
+    answer
+        Function that answers questions of readers, see :meth:`StateReader.ask`; it is called in a thread of
+        its own with bytes, and returns bytes.
 
     Attributes
     ----------
@@ -96,6 +101,7 @@ class StatePublisher(Closing):
         direct: bool = True,
         announce: Callable[[StatePublisher], None] = lambda _: None,
         offset: float = 0.0,
+        answer: Callable[[bytes], bytes] | None = None,
     ) -> None:
         self.source, self.offset, self.is_closed, self._announce = source, offset, False, announce
         self._layout = _Layout.make(coordinates)
@@ -114,9 +120,13 @@ class StatePublisher(Closing):
         elif server is None:
             raise InvalidValueError(f"The source {source!r} has neither a socket nor a server to send by.")
         self._transports = [transport for transport in (self._own, server) if transport is not None]
-        self._asked = [transport.answers(f"{self._key}/layout") for transport in self._transports]
-        for requests in self._asked:
-            threading.Thread(target=self._tell, args=(requests,), daemon=True).start()
+        answers: dict[str, Callable[[bytes], bytes]] = {"layout": self._tell_layout}
+        if answer is not None:
+            answers["ask"] = answer
+        self._asked: list[Questions] = []
+        for (end, function), transport in product(answers.items(), self._transports):
+            self._asked.append(requests := transport.answers(f"{self._key}/{end}"))
+            threading.Thread(target=_answer, args=(requests, function), daemon=True).start()
 
     @property
     def coordinates(self) -> tuple[str, ...]:
@@ -134,7 +144,7 @@ class StatePublisher(Closing):
         self._layout = _Layout.make(coordinates)
         self._announce(self)
 
-    def put(self, values: ArrayLike, stamp: float | None = None) -> None:
+    def put(self, values: ArrayLike, stamp: float | None = None, note: bytes = b"") -> None:
         """Send a vector; it waits for nobody.
 
         Parameters
@@ -143,6 +153,8 @@ class StatePublisher(Closing):
             Values of the coordinates, shape (n,): [m], [rad] and their rates by time.
         stamp
             Time of the values by the source's clock [s]; the time of this computer unless given.
+        note
+            What else is to be said, in an encoding of the source's own.
 
         Raises
         ------
@@ -168,7 +180,7 @@ class StatePublisher(Closing):
         time_of_values = now if stamp is None else finite_number(stamp)
         if time_of_values is None:
             raise InvalidValueError(f"The stamp of a vector is a time in seconds, not {stamp!r}.")
-        body = vector.tobytes()
+        body = vector.tobytes() + note
         with self._lock:
             self._number += 1
             message = _HEADER.pack(layout.digest, self._run, self._number, time_of_values, now) + body
@@ -187,9 +199,32 @@ class StatePublisher(Closing):
             self._claim.release()
         self._announce(self)
 
-    def _tell(self, requests: Questions) -> None:
-        for request in requests:
-            request.answer(msgspec.msgpack.encode(self._layout.names))
+    def _tell_layout(self, _: bytes) -> bytes:
+        return msgspec.msgpack.encode(self._layout.names)
+
+
+class Newest(NamedTuple):
+    """Newest vector of a source.
+
+    Attributes
+    ----------
+    names
+        Names of its coordinates.
+    values
+        Their values (n,): [m], [rad] and their rates by time.
+    stamp
+        Time of the values by the source's clock [s].
+    note
+        What the source has said beside it.
+    arrival
+        Time at which it came in, by the clock that only counts [s].
+    """
+
+    names: tuple[str, ...]
+    values: Array
+    stamp: float
+    note: bytes
+    arrival: float
 
 
 class StateReader(Closing):
@@ -290,6 +325,28 @@ class StateReader(Closing):
         names = sorted(name for (_, name), _ in found)
         return State(values, stamp=found[-1][0][0] if found else None, source=", ".join(names))
 
+    def newest(self, source: str) -> Newest | None:
+        """Return the newest vector of a source with the note beside it; None if none has come in."""
+        stream = self._streams.get(source)
+        if stream is None or (latest := stream.latest) is None:
+            return None
+        return Newest(latest.layout.names, latest.values, latest.stamp, latest.note, latest.arrival)
+
+    def ask(self, source: str, question: bytes, timeout: float) -> bytes:
+        """Return the answer of a source to a question.
+
+        Raises
+        ------
+        OfflineError
+            If there is no such source, or it does not answer within the time-out [s].
+        """
+        seconds, stream = as_tolerance(timeout, "A timeout"), self._streams.get(source)
+        transport = None if stream is None else stream.transport
+        if stream is not None and transport is not None:
+            with contextlib.suppress(NoAnswerError):
+                return transport.ask(f"{stream.key}/ask", question, seconds)
+        raise OfflineError(f"'{source}' does not answer.")
+
     @property
     def age(self) -> dict[str, float]:
         """Time since the newest vector of each source came in [s]; of those that have sent any."""
@@ -343,6 +400,7 @@ class _Vector(NamedTuple):
     layout: _Layout
     values: Array
     stamp: float
+    note: bytes
     arrival: float
 
 
@@ -384,7 +442,9 @@ class _Stream:
         self.endpoint, self.offset = endpoint, 0.0
         self.latest: _Vector | None = None
         self.received = self.lost = 0
-        self._reader, self._key, self._server = reader, key, server
+        self.key = key
+        self.transport: Transport | None = None
+        self._reader, self._server = reader, server
         self._open: list[Messages | Transport] = []
         self._layouts: dict[int, _Layout] = {}
         self._announced: tuple[str, ...] | None = None
@@ -416,10 +476,11 @@ class _Stream:
         while not self._closed.is_set():
             try:
                 transport = self._server or Transport.connect(self.endpoint)
-                messages = transport.subscribe(self._key)
+                messages = transport.subscribe(self.key)
             except NoAnswerError:
                 self._closed.wait(_RETRY_SECONDS)
                 continue
+            self.transport = transport
             self._open = [messages] if transport is self._server else [messages, transport]
             if self._closed.is_set():
                 self.close()
@@ -432,9 +493,9 @@ class _Stream:
             return
         digest, run, number, stamp, _ = _HEADER.unpack_from(message)
         layout = self._layouts.get(digest) or self._ask(digest, transport)
-        if layout is None or len(message) != _HEADER.size + _VALUE.itemsize * len(layout.names):
+        if layout is None or len(message) < (end := _HEADER.size + _VALUE.itemsize * len(layout.names)):
             return
-        values = np.frombuffer(message, _VALUE, offset=_HEADER.size)
+        values = np.frombuffer(message[:end], _VALUE, offset=_HEADER.size)
         if not (math.isfinite(stamp) and np.isfinite(values).all()):
             return
         if run == self._run:
@@ -443,7 +504,7 @@ class _Stream:
             self.lost += number - self._number - 1
         self._run, self._number = run, number
         self.received += 1
-        self.latest = _Vector(layout, values, stamp, time.monotonic())
+        self.latest = _Vector(layout, values, stamp, message[end:], time.monotonic())
         if len(layout.targets) or not self._reader.coordinates:
             self._reader._notify()
 
@@ -453,11 +514,16 @@ class _Stream:
         if now < self._ask_again:
             return None
         with contextlib.suppress(NoAnswerError, msgspec.MsgspecError, UnicodeDecodeError):
-            answer = transport.ask(f"{self._key}/layout", b"", _ASK_SECONDS)
+            answer = transport.ask(f"{self.key}/layout", b"", _ASK_SECONDS)
             self._learn(msgspec.msgpack.decode(answer, type=tuple[str, ...]))
         if digest not in self._layouts:
             self._ask_again = time.monotonic() + _RETRY_SECONDS
         return self._layouts.get(digest)
+
+
+def _answer(requests: Questions, function: Callable[[bytes], bytes]) -> None:
+    for request in requests:
+        request.answer(function(request.payload))
 
 
 def _key(name: str, source: str) -> str:

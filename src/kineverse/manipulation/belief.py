@@ -149,7 +149,7 @@ class TrackedBelief:
 
     def __init__(self, model: ModelView, robot: Robot | str, sensors: Sensors | None = None) -> None:
         self.sensors = sensors = Sensors() if sensors is None else sensors
-        self._model = model
+        self.model = model
         robot = Robot.of(model, robot)
         remarks = []
         self.camera, marked = sensors.find_frames(robot)
@@ -234,8 +234,8 @@ class TrackedBelief:
         covariance = pose_covariance(*sensors.pose_noise(0.0, *_FLOOR))
         outliers = Outliers(min(sensors.outliers, 0.5), sensors.reach) if sensors.outliers > 0.0 else None
         observed = [ObservedPose(name, covariance=covariance) for name in self._frames]
-        tracker = Tracker(self._model, observed, outliers=outliers)
-        start = self._model.default_state()
+        tracker = Tracker(self.model, observed, outliers=outliers)
+        start = self.model.default_state()
         tracker.reset({s: start[s] for s in tracker.symbols})
         return tracker
 

@@ -1,0 +1,171 @@
+"""What the processes of a live system say to each other: vectors, notes beside them, and questions.
+
+Numbers go as vectors of state streams, so that everybody can read them; notes say the rest, as msgpack. All
+stamps are times of the robot, which is the clock of the world's computer.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from typing import Any, Final, TypeAlias, TypeVar
+
+import msgspec
+import numpy as np
+
+from kineverse.errors import KineverseError
+from kineverse.exchange.state import StateReader
+from kineverse.lie import Array
+
+ROBOT: Final = "robot"  # source of encoders, touch sensors and guards
+CAMERA: Final = "camera"  # source of poses of visible markers
+TRUTH: Final = "truth"  # source of the true state of a simulated world, for pages, recordings and judges
+COMMANDS: Final = "commands"  # source of speeds
+TRACKER: Final = "tracker"  # source of the believed state
+ACTIVITY: Final = "activity"  # source of what is being done, and why
+LEARNER: Final = "learner"  # source of what is thought of joints
+
+TICK: Final = 0.01  # time between two readings of encoders [s]
+TIMEOUT: Final = 0.04  # age of the state of a command from which on the robot stops [s]
+OLDEST: Final = 0.1  # age of the state of a command that is never obeyed [s]
+
+
+class RobotNote(msgspec.Struct, array_like=True):
+    """Note beside the encoders of a robot."""
+
+    world: str  # name of what the robot acts in
+    timeout: float  # time after which a command no longer acts [s]
+    touching: list[str]  # frames whose touch sensors report
+    stopped: str = ""  # why the robot takes no commands at all; empty if it does
+    force: float = math.nan  # largest force between the robot and another body [N]
+    refused: int = 0  # commands that were too old, in all
+    late: int = 0  # ticks that began late by more than half of one, in all
+    dropped: int = 0  # ticks that were left out, in all
+    ticks: int = 0
+    factor: float = 1.0  # time of the world by the time that has passed
+
+
+class CameraNote(msgspec.Struct, array_like=True):
+    """Note of a camera: one picture."""
+
+    picture: int  # its number
+    poses: dict[str, bytes]  # world_T_frame of the visible markers as 16 doubles
+
+    @classmethod
+    def make(cls, picture: int, poses: Mapping[str, Array]) -> CameraNote:
+        """Return the note of some poses (4, 4)."""
+        return cls(picture, {name: np.ascontiguousarray(pose).tobytes() for name, pose in poses.items()})
+
+    def read(self) -> dict[str, Array]:
+        """Return the poses (4, 4) by frame."""
+        size = 16 * np.dtype(float).itemsize
+        found = {name: data for name, data in self.poses.items() if len(data) == size}
+        return {name: np.frombuffer(data).reshape(4, 4) for name, data in found.items()}
+
+
+class CommandNote(msgspec.Struct, array_like=True):
+    """Note beside the speeds of a robot, zero where none was given."""
+
+    number: int  # of the command, by its sender
+    duration: float  # time for which it acts [s]
+    stamped: bool  # whether the stamp of the vector is that of a state
+    kept: list[int]  # places of the fingers that keep their speed
+    planned: dict[str, float]  # speeds planned for objects [m/s], [rad/s]
+
+
+class TrackerNote(msgspec.Struct, array_like=True):
+    """Note beside a believed state."""
+
+    deviations: bytes  # standard deviations of the coordinates, as doubles
+    seen: dict[str, float]  # time at which a marker of a coordinate was seen last [s]
+    lost: list[str]  # coordinates whose track is lost, or that were never seen
+    milliseconds: float  # time from a reading to its estimate
+
+
+class ActivityNote(msgspec.Struct, array_like=True):
+    """Note of a behaviour: what it does, and why."""
+
+    behaviour: str
+    doing: str = ""  # the skill and its object, or what is waited for
+    why: str = ""
+    phase: str = ""  # phase of the skill
+    way: bytes = b""  # points (k, 3) of the way ahead of the hand, as doubles [m]
+    wanted: bytes = b""  # pose (4, 4) at which the hand is wanted now
+    vectors: dict[str, bytes] = {}  # vectors of the controller, origin and vector (2, 3)
+    done: int = 0  # skills that were done, in all
+    failed: int = 0
+    last: str = ""  # result of the last skill
+    steps: int = 0  # control steps, in all
+    late: int = 0  # those that began late by more than 5 ms, in all
+    pairs: list[list[list[str]]] = []  # bodies that the skill means to bring together
+
+
+class Ask(msgspec.Struct):
+    """Question to a world: something that people do."""
+
+    do: str
+    arguments: dict[str, Any] = {}
+
+
+class Answer(msgspec.Struct):
+    """Answer to a question: an error, or what was asked for."""
+
+    error: str = ""
+    value: Any = None
+
+
+Note = TypeVar("Note")
+Handler: TypeAlias = Callable[..., Any]
+
+
+def encode(note: object) -> bytes:
+    """Return a note as bytes."""
+    return msgspec.msgpack.encode(note)
+
+
+def decode(data: bytes, kind: type[Note]) -> Note | None:
+    """Return a note of a kind; None for bytes that are none, such as of another version."""
+    try:
+        return msgspec.msgpack.decode(data, type=kind)
+    except msgspec.MsgspecError:
+        return None
+
+
+def read_note(reader: StateReader, source: str, kind: type[Note]) -> Note | None:
+    """Return the newest note of a source; None without any."""
+    newest = reader.newest(source)
+    return None if newest is None else decode(newest.note, kind)
+
+
+def ask(reader: StateReader, source: str, do: str, timeout: float = 5.0, **arguments: Any) -> Any:
+    """Ask a process to do something, and return its answer.
+
+    Raises
+    ------
+    OfflineError
+        If it does not answer.
+    KineverseError
+        With its reason if it cannot do that.
+    """
+    answer = decode(reader.ask(source, encode(Ask(do, arguments)), timeout), Answer)
+    if answer is None:
+        raise KineverseError(f"'{source}' has answered in another language; is it of another version?")
+    if answer.error:
+        raise KineverseError(answer.error)
+    return answer.value
+
+
+def answer_by(handlers: Mapping[str, Handler]) -> Callable[[bytes], bytes]:
+    """Return a function that answers questions by functions, for :class:`.StatePublisher`."""
+
+    def answer(data: bytes) -> bytes:
+        question = decode(data, Ask)
+        handler = None if question is None else handlers.get(question.do)
+        if question is None or handler is None:
+            return encode(Answer("That is not understood here; is it of another version?"))
+        try:
+            return encode(Answer(value=handler(**question.arguments)))
+        except (KineverseError, TypeError) as error:
+            return encode(Answer(str(error)))
+
+    return answer

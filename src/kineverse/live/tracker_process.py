@@ -1,0 +1,126 @@
+"""State estimator of a live system: from readings of the robot and pictures to the believed state."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+import numpy as np
+
+from kineverse.exchange import LiveModel
+from kineverse.manipulation import TrackedBelief
+from kineverse.model.commits.follower import follow
+from kineverse.model.model_view import ModelView
+from kineverse.state import State
+from kineverse.symbols import Symbol, parse_symbol_name
+from kineverse.worlds import Observation, Sensors
+
+from .streams import (
+    CAMERA,
+    COMMANDS,
+    ROBOT,
+    TICK,
+    TRACKER,
+    CameraNote,
+    CommandNote,
+    RobotNote,
+    TrackerNote,
+    decode,
+    encode,
+)
+
+
+class TrackerProcess:
+    """Tracker that publishes a believed state for each reading of the robot.
+
+    Parameters
+    ----------
+    live
+        The served model. After an edit the tracker is made anew, and begins with what was believed.
+    robot
+        Prefix of the robot's names.
+    sensors
+        The noise to expect.
+    """
+
+    def __init__(self, live: LiveModel, robot: str, sensors: Sensors) -> None:
+        self._robot, self._sensors = robot, sensors
+        self._follower = follow(live, self._make)
+        self.belief, self._version = self._follower.current
+        self._symbols = self._list_symbols()
+        self._reader = live.exchange.reader()
+        self._publisher = live.exchange.publisher(TRACKER, self._symbols)
+        self._picture, self._stamp = -1, 0.0
+
+    def _make(self, model: ModelView) -> TrackedBelief:
+        belief = TrackedBelief(model, self._robot, self._sensors)
+        belief.tracker.wait()
+        return belief
+
+    def _list_symbols(self) -> list[Symbol]:
+        return [s for s in self._follower.value.model.symbols if not s.order]
+
+    def run(self, is_over: Callable[[], bool] = lambda: False) -> None:
+        """Track until it is over."""
+        while not is_over():
+            if self._reader.wait(0.1):
+                self.step()
+
+    def step(self) -> bool:
+        """Publish the state of the newest readings; return False if there are none that are newer."""
+        begin = time.perf_counter()
+        newest = self._reader.newest(ROBOT)
+        note = None if newest is None else decode(newest.note, RobotNote)
+        if newest is None or note is None or newest.stamp <= self._stamp:
+            return False
+        self._follow()
+        self._stamp = newest.stamp
+        model, poses, seen = self.belief.model, {}, None
+        known = {str(s): s for s in self._symbols}
+        named = zip(newest.names, newest.values.tolist(), strict=True)
+        joints = {known[name]: value for name, value in named if name in known}
+        picture = self._reader.newest(CAMERA)
+        if picture is not None:
+            shown = decode(picture.note, CameraNote)
+            if shown is not None and shown.picture != self._picture:
+                self._picture, seen = shown.picture, picture.stamp
+                poses = {name: pose for name, pose in shown.read().items() if name in model.frames}
+        observation = Observation(newest.stamp, joints, poses, frozenset(note.touching), seen)
+        state = self.belief.update(observation, newest.stamp, self._read_commands())
+        self._publish(state, newest.stamp, 1e3 * (time.perf_counter() - begin))
+        return True
+
+    def _read_commands(self) -> State | None:
+        """Return the speeds that act, and those planned for objects; None if nobody commands any."""
+        newest = self._reader.newest(COMMANDS)
+        note = None if newest is None else decode(newest.note, CommandNote)
+        if newest is None or note is None or time.monotonic() - newest.arrival > note.duration + 2 * TICK:
+            return None
+        values = dict(zip(newest.names, newest.values.tolist(), strict=True)) | note.planned
+        return State({Symbol(*parse_symbol_name(name)): value for name, value in values.items()})
+
+    def _publish(self, state: State, stamp: float, milliseconds: float) -> None:
+        deviations = np.array([self.belief.deviation(s) for s in self._symbols])
+        seen = {str(s): at for s, at in self.belief.seen.items()}
+        lost = [str(s) for s, d in zip(self._symbols, deviations, strict=True) if not np.isfinite(d)]
+        note = TrackerNote(deviations.tobytes(), seen, lost, milliseconds)
+        self._publisher.put(state.vector(self._symbols), stamp, encode(note))
+
+    def _follow(self) -> None:
+        """Go on with the tracker of an edited model, once it is made."""
+        if self._follower.version == self._version:
+            return
+        before = self.belief.tracker.estimate.state
+        self.belief, self._version = self._follower.current
+        tracker = self.belief.tracker
+        tracker.reset({s: before[s] for s in tracker.symbols if s in before}, at=self._stamp)
+        symbols = self._list_symbols()
+        if symbols != self._symbols:
+            self._symbols = symbols
+            self._publisher.set_coordinates(symbols)
+
+    def close(self) -> None:
+        """End the stream."""
+        self._publisher.close()
+        self._reader.close()
+        self._follower.close()

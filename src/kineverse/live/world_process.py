@@ -1,0 +1,227 @@
+"""World of a live system: a simulated robot in real time, which obeys fresh commands, and publishes readings.
+
+Every tick lasts 10 ms by the clock of the computer. What comes too late is left out: a world that was held up
+goes on from where it was, at the present time, and does not hurry.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import msgspec
+
+from kineverse._checks import as_positive
+from kineverse.errors import InvalidValueError, KineverseError
+from kineverse.exchange import LiveModel
+from kineverse.model.commits.follower import Follower, follow
+from kineverse.model.model_view import ModelView
+from kineverse.state import State
+from kineverse.worlds import SimulatedWorld
+
+from .streams import (
+    CAMERA,
+    COMMANDS,
+    OLDEST,
+    ROBOT,
+    TICK,
+    TIMEOUT,
+    TRUTH,
+    CameraNote,
+    CommandNote,
+    Handler,
+    RobotNote,
+    answer_by,
+    decode,
+    encode,
+)
+
+_LATE = 0.005  # time after which a tick counts as late [s]
+_TRUTH_TICKS = 3  # ticks between two true states
+_KEPT_TICKS = 10  # ticks between two states in the file
+EMERGENCY = "emergency stop"
+
+
+class WorldProcess:
+    """World whose robot is moved by the newest commands of a model server's streams.
+
+    Parameters
+    ----------
+    live
+        The served model. Its edits are followed: the world is made anew from where everything is.
+    make
+        Function that makes the world of a model.
+    start
+        State at the beginning.
+    timeout
+        Age of the state of a command from which on the robot stops [s].
+    kept
+        File that keeps the true state; if there is one, the world begins in it.
+    follows
+        Whether edits of the served model change the world, too. False for a world with a model of its own.
+
+    Attributes
+    ----------
+    world
+        The present world.
+    stopped
+        Why the robot takes no commands; empty if it does.
+    """
+
+    def __init__(
+        self,
+        live: LiveModel,
+        make: Callable[[ModelView], SimulatedWorld],
+        start: State,
+        *,
+        timeout: float = TIMEOUT,
+        kept: str | os.PathLike[str] | None = None,
+        follows: bool = True,
+    ) -> None:
+        self._timeout = as_positive(timeout, "timeout=", "time in s, such as 0.04")
+        self._live, self._kept = live, None if kept is None else Path(kept)
+        self._follower: Follower[SimulatedWorld] | None = follow(live, make) if follows else None
+        self.world = make(live.snapshot()) if self._follower is None else self._follower.value
+        self._version = None if self._follower is None else self._follower.version
+        self.stopped = ""
+        self._ticks = self._late = self._dropped = self._refused = self._picture = 0
+        self._command: tuple[float, int] = (-math.inf, -1)  # the last one that was counted as too old
+        self._fingers: dict[str, float] = {}
+        self._begin(self._restore(start))
+        self._reader = live.exchange.reader()
+        handlers: dict[str, Handler] = {"stop": self.stop, "release": self.release, "move": self._move}
+        self._robot = live.exchange.publisher(ROBOT, self.world.robot.coordinates, answer=answer_by(handlers))
+        self._camera = live.exchange.publisher(CAMERA, ())
+        self._truth = live.exchange.publisher(TRUTH, self._symbols)
+        self._first = self._epoch = time.monotonic()
+        self._wall = time.time() - self._epoch  # from the clock that only counts to that of stamps [s]
+
+    def _begin(self, state: State) -> None:
+        self.world.reset(state)
+        self._symbols = [s for s in self.world.model.symbols if not s.order]
+        self._finger_names = {
+            str(s.derivative()) for gripper in self.world.robot.grippers for s in gripper.joints
+        }
+        self._rest = dict.fromkeys(self._finger_names, 0.0)
+
+    # -- what is asked ---------------------------------------------------------------------------------------
+
+    def stop(self, why: str = EMERGENCY) -> None:
+        """Stop the robot until it is released."""
+        self.stopped = why
+
+    def release(self) -> None:
+        """Let the robot take commands again."""
+        self.stopped = ""
+
+    def _move(self, coordinate: str, value: float) -> None:
+        raise InvalidValueError(f"'{coordinate}' cannot be moved to {value:g} by hand.")
+
+    # -- ticks -----------------------------------------------------------------------------------------------
+
+    def run(self, is_over: Callable[[], bool] = lambda: False) -> None:
+        """Run in real time until it is over."""
+        due = time.monotonic() + TICK
+        while not is_over():
+            now = time.monotonic()
+            if now < due:
+                time.sleep(due - now)
+                now = time.monotonic()
+            late = now - due
+            self._late += late > _LATE
+            if late > TICK:
+                missed = math.floor(late / TICK)
+                self._dropped += missed
+                due += missed * TICK
+            self.tick(due + self._wall)
+            due += TICK
+
+    def tick(self, now: float) -> None:
+        """Advance by one tick to a time [s], and publish the readings."""
+        self._follow()
+        self.world.apply(self._choose_speeds(now), TICK)
+        self._ticks += 1
+        self._publish(now)
+        if self._kept is not None and self._ticks % _KEPT_TICKS == 0:
+            self._keep()
+
+    def _choose_speeds(self, now: float) -> dict[str, float]:
+        """Return the speeds of the newest command, unless it is too old; fingers then close no further."""
+        newest = self._reader.newest(COMMANDS)
+        note = None if newest is None else decode(newest.note, CommandNote)
+        if newest is None or note is None or self.stopped:
+            return self._rest
+        arrived = now - (time.monotonic() - newest.arrival)
+        if note.stamped:
+            until = newest.stamp + self._timeout
+            number = newest.stamp, note.number
+            if now - newest.stamp > OLDEST and number != self._command and arrived > now - TICK:
+                self._command = number
+                self._refused += 1
+        else:
+            until = arrived + max(note.duration, TICK)
+        if not now < until + 1e-9 or newest.stamp > now + TICK:
+            return self._rest
+        speeds = dict(zip(newest.names, newest.values.tolist(), strict=True))
+        for k in note.kept:
+            speeds[newest.names[k]] = self._fingers.get(newest.names[k], 0.0)
+        self._fingers = {name: speeds[name] for name in self._finger_names if name in speeds}
+        known = {str(v) for v in self.world.robot.speeds}
+        return {name: value for name, value in speeds.items() if name in known}
+
+    def _publish(self, now: float) -> None:
+        world, observation = self.world, self.world.observe()
+        coordinates = world.robot.coordinates
+        stamp = now + observation.stamp - world.time
+        passed = time.monotonic() - self._first
+        note = RobotNote(
+            world.name, self._timeout, sorted(observation.touching), self.stopped, world.peak_force,
+            self._refused, self._late, self._dropped, self._ticks, self._ticks * TICK / max(passed, TICK),
+        )  # fmt: skip
+        self._robot.put([observation.joints[s] for s in coordinates], stamp, encode(note))
+        if observation.poses:
+            self._picture += 1
+            shown = CameraNote.make(self._picture, observation.poses)
+            self._camera.put((), now + observation.picture_stamp - world.time, encode(shown))
+        if self._ticks % _TRUTH_TICKS == 0:
+            self._truth.put(world.state.vector(self._symbols), now)
+
+    # -- edits, and what is kept -----------------------------------------------------------------------------
+
+    def _follow(self) -> None:
+        """Go on in the world of an edited model, once it is made."""
+        if self._follower is None or self._follower.version == self._version:
+            return
+        before, state = self._symbols, State(dict(self.world.state))
+        self.world, self._version = self._follower.current
+        self._begin(state)
+        if before != self._symbols:
+            self._truth.set_coordinates(self._symbols)
+
+    def _keep(self) -> None:
+        assert self._kept is not None
+        values = {str(s): float(v) for s, v in self.world.state.items() if math.isfinite(v)}
+        part = self._kept.with_suffix(".part")
+        part.write_bytes(msgspec.msgpack.encode(values))
+        part.replace(self._kept)
+
+    def _restore(self, start: State) -> State:
+        """Return the state that was kept, or the one at the beginning."""
+        if self._kept is None or not self._kept.is_file():
+            return start
+        try:
+            values = msgspec.msgpack.decode(self._kept.read_bytes(), type=dict[str, float])
+        except (msgspec.MsgspecError, OSError) as error:
+            raise KineverseError(f"{self._kept} holds no state: {error}.") from None
+        known = {str(s): s for s in self.world.model.symbols}
+        return start.updated({known[name]: value for name, value in values.items() if name in known})
+
+    def close(self) -> None:
+        """End the streams."""
+        for one in (self._robot, self._camera, self._truth, self._reader):
+            one.close()
+        if self._follower is not None:
+            self._follower.close()
