@@ -181,7 +181,8 @@ class WorldProcess:
         passed = time.monotonic() - self._first
         note = RobotNote(
             world.name, self._timeout, sorted(observation.touching), self.stopped, world.peak_force,
-            self._commanded, self._refused, self._late, self._dropped, self._ticks, self._ticks * TICK / max(passed, TICK),
+            self._commanded, self._refused, self._late, self._dropped, self._ticks,
+            self._ticks * TICK / max(passed, TICK),
         )  # fmt: skip
         self._robot.put([observation.joints[s] for s in coordinates], stamp, encode(note))
         if observation.poses:
