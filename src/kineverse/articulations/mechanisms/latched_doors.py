@@ -241,7 +241,7 @@ class Microwave(SprungDoor, document_kind="Microwave"):
     """Microwave oven: its door stays shut unless the button is pressed, and then springs ajar.
 
     The spring of the door opens it as far as the friction of its hinge allows, to door_rest - friction /
-    door_stiffness, 0.1 rad. So it stays ajar once the button is let go. The friction holds the wide open door.
+    door_stiffness, 0.1 rad. So it stays ajar once the button is let go. Friction holds the wide open door.
 
     ================  ======================================================================
     ``name/door``     q [rad]: base_T_door = rotation_z(q)
@@ -282,10 +282,10 @@ class Microwave(SprungDoor, document_kind="Microwave"):
     catch: float = 0.004
     stiffness: float = 500.0
     rest: float = -0.004
-    door_stiffness: float = 1.0
+    door_stiffness: float = 3.0
     door_rest: float = 1.1
-    friction: float = 1.0
-    damping: float = 0.5
+    friction: float = 3.0
+    damping: float = 1.0
 
     def __post_init__(self) -> None:
         self.check_lengths("depth", "door_stiffness", "friction", "damping")
@@ -314,7 +314,8 @@ class Microwave(SprungDoor, document_kind="Microwave"):
         behind = (t / 2 + depth / 2, w / 2, h / 2)
         out, across = -t / 2 - 0.025, 0.92 * w
         grip = rod_shape((out, across, 0.15 * h), (out, across, 0.85 * h), 0.008, STEEL)
-        side = box_shape((depth + t, controls, h), (depth / 2, w + controls / 2, h / 2), DARK)
+        gap = 0.004  # the corner of the door sweeps over its edge
+        side = box_shape((depth + t, controls - gap, h), (depth / 2, w + (controls + gap) / 2, h / 2), DARK)
         place = shift(-t / 2, w + controls / 2, 0.2 * h), translation_along(X, self.q("button"))
         knob = box_shape((0.02, 0.6 * controls, 0.12 * h), (0.0, 0.0, 0.0), RED)
         return {
