@@ -1,11 +1,11 @@
 """Quasi-static world: touched bodies are displaced along the contact normal, a held body follows the hand.
 
-It takes speeds of the robot alone. An object stands still unless a body of the robot would penetrate it; then
-it moves by the least that its limits, speed limits and locks allow, see :mod:`.quasistatic`. So objects can
-be pushed and not dragged, have no inertia, and nothing falls. What cannot give way is penetrated, and
-:meth:`KinematicWorld.contacts` reports it; so is furniture that never moves. What the robot moves stops at
-other furniture, beyond the overlaps of the start, see :mod:`.furniture_overlaps`. The robot goes exactly
-where its speeds lead, also beyond its limits.
+It takes speeds of the robot alone. An object stands still unless a body of the robot would penetrate it, or
+its spring moves it; then it moves by the least that its limits, speed limits and locks allow, see
+:mod:`.quasistatic`. So objects can be pushed and not dragged, have no inertia, and nothing falls. What cannot
+give way is penetrated, and :meth:`KinematicWorld.contacts` reports it; so is furniture that never moves. What
+the robot moves stops at other furniture, beyond the overlaps of the start, see :mod:`.furniture_overlaps`. The
+robot goes exactly where its speeds lead, also beyond its limits.
 """
 
 from __future__ import annotations
@@ -142,6 +142,10 @@ class KinematicWorld:
             left_out,
         )
         remarks += [f"'{name}' is not enforced: {why}" for name, why in self._motion.skipped]
+        remarks += [
+            f"the spring of '{name}' does nothing, as it carries a weight, and nothing has one here"
+            for name in self._motion.springs.skipped
+        ]
         self._grip = (
             None
             if gripper is None
@@ -264,11 +268,12 @@ class KinematicWorld:
         moved = motion.travel() - before
         # The travel restarts at some time.
         moved[moved < 0.0] = _UNKNOWN_TRAVEL
-        travel = float(moved.max(initial=0.0)) + reach
+        sprung = motion.spring_travel(time)
+        travel = float(moved.max(initial=0.0)) + reach + sprung
         grips = grip is not None and (grip.held is not None or reach > 0.0)
         # What is not near now has not been touched on the way.
         longest = motion.longest_motion(moved, travel)
-        count = 0 if longest is None else math.ceil((longest + reach) / _SUBSTEP)
+        count = 0 if longest is None else math.ceil((longest + reach + sprung) / _SUBSTEP)
         if grip is not None and grip.held is not None:
             count = max(count, math.ceil(travel / _HELD_SUBSTEP))
         count = min(count, _MOST_SUBSTEPS)
@@ -277,7 +282,7 @@ class KinematicWorld:
             for _ in range(count):
                 motion.place(self._integrate(motion.q, arm, time / count))
                 self._settle(time / count, travel / count, grips)
-        elif longest is not None or grips:
+        elif longest is not None or grips or sprung:
             self._settle(time, travel, grips)
 
     def _settle(self, time: float, moved: float, grips: bool) -> None:

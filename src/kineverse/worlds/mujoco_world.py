@@ -21,7 +21,7 @@ from kineverse.symbols import Symbol
 from . import mujoco_model
 from .mujoco_model import add_floor
 from .mujoco_servos import BANDWIDTH, GripperDrive, JointServos, SpeedMap, base_coordinates
-from .mujoco_state import MujocoContacts, MujocoCoordinates
+from .mujoco_state import MujocoContacts, MujocoCoordinates, MujocoLocks
 from .robot import Robot
 from .robot_interface import Observation
 from .sensor_sampler import SensorSampler
@@ -179,7 +179,9 @@ class MujocoWorld:
         if gripper is None:
             gripper = next(iter(robot.grippers), None)
         fingers = () if gripper is None else gripper.fingers
-        spec = mujoco_model.export_spec(model, leave_out, self._remark)
+        left_out = tuple(leave_out)
+        self._locks = MujocoLocks(model, robot, left_out)
+        spec = mujoco_model.export_spec(model, left_out, self._locks.names, self._remark)
         spec.option.timestep = self._step
         mujoco_model.add_masses(spec, self._remark)
         mujoco_model.remark_missing_shapes(spec, self._is_robot, self._remark)
@@ -193,6 +195,8 @@ class MujocoWorld:
         self._remark(f"gravity does not act on '{robot.name}': its servos are taken to carry the weight")
         compiled = mujoco_model.compile_world(spec)
         self._coordinates = MujocoCoordinates(model, compiled)
+        for name in self._locks.keep(self._coordinates.address):
+            self._remark(f"'{name}' is not enforced: it is about something else than positions of joints")
         pairs = mujoco_model.exclude_overlaps(
             spec, compiled, model, self._coordinates, self._is_robot, _SAMPLES, seed
         )
@@ -232,6 +236,7 @@ class MujocoWorld:
         self._data = mujoco().MjData(self._compiled)
         self._contacts = MujocoContacts(self._compiled, self._is_robot, fingers)
         self._servos.connect(self._compiled)
+        self._locks.connect(self._compiled, self._coordinates.address)
         self._bounds = SimulationBounds(
             self._compiled, self._coordinates, model, self._servos.efforts, robot, self._is_robot
         )
@@ -294,6 +299,7 @@ class MujocoWorld:
         self._broken = ""
         self._commands.reset()
         self._servos.reset(data)
+        self._locks.reset()
         if self._drive is not None:
             self._drive.reset(data)
         engine.mj_forward(self._compiled, data)
@@ -365,6 +371,7 @@ class MujocoWorld:
         self._servos.drive(data, rates[: self._count])
         if self._drive is not None:
             self._drive.drive(data, rates[self._count :])
+        self._locks.update(data)
         mujoco().mj_step(self._compiled, data)
         self._ticks += 1
 
