@@ -14,9 +14,6 @@ from kineverse._checks import as_count, as_positive
 from kineverse.errors import InvalidValueError
 from kineverse.grasping import Gripper, Handle, find_handle
 from kineverse.manipulation.outcome import Outcome, SkillError
-from kineverse.manipulation.pushing.base_placement import find_push_start
-from kineverse.manipulation.pushing.push_controller import Pushing
-from kineverse.manipulation.pushing.push_skill import push
 from kineverse.manipulation.session import Session
 from kineverse.manipulation.skill_run import (
     SkillRun,
@@ -26,13 +23,13 @@ from kineverse.manipulation.skill_run import (
     explain_fixed,
     find_object_coordinate,
 )
-from kineverse.state import State
 from kineverse.symbols import Symbol
 
 from .approach_planner import Approach, Opener
 from .base_placement import BasePlacement
 from .contact_phases import ContactPhase, PhasePlanner, Way
 from .hand_motion import HandMotion, SlipError, move_held
+from .planned_push import LEAST_PUSH, PlannedPush, press
 
 _SLANT = math.radians(50.0)  # largest slant of grasps where those from across the handle lead nowhere [rad]
 _PROOF = 200  # largest number of sampled bases that are to prove that an object is too high
@@ -41,11 +38,6 @@ _LATE = 1.0  # time before the end at which it counts as up [s]
 _MOST_SLIPS, _LEAST_PROGRESS = 2, 0.1
 """Number of slips from which on a grasp has to take an object further, by a share of the rest."""
 _HEIGHTS = 12  # number of values at which the height of an object is compared with that of the hand
-_PUSH_STARTS = 960  # most sampled starts; a limit of time would let results depend on other processes
-_LEAST_PUSH = 0.2  # least share of the rest that a push is for
-_LONGER, _AFTER = 1.5, 2.0  # share of the time in the roll-out that a partial push lasts, and rest [s]
-_PLANNING, _PUSHING = 1.0, 10.0  # largest time to plan the path to a push, and least time for it [s]
-_PRESSING = 20.0  # longest time of a press [s]
 
 
 def open_object(
@@ -325,7 +317,10 @@ class OpeningRun(SkillRun):
             if phase.handle is self.handle:
                 return phase.way
             try:
-                self._press(phase) if phase.handle is None else self._move_other(phase, phase.handle)
+                if phase.handle is None:
+                    press(self.motion, phase, self._seed)
+                else:
+                    self._move_other(phase, phase.handle)
             except SkillError as error:
                 if self.session.fault or self.left < 0.0:
                     raise
@@ -358,14 +353,6 @@ class OpeningRun(SkillRun):
             self.measures[name] += outcome.measures[name]
         if not outcome:
             raise SkillError(outcome.measures["failure"], outcome.reason)
-
-    def _press(self, phase: ContactPhase) -> None:
-        """Press a part without a handle as a phase says, or raise SkillError."""
-        tolerance = choose_tolerance(
-            self.model, phase.coordinate, self.session.state, phase.target, phase.tolerance
-        )
-        pushing, _ = self._find_push(self._seed, phase.coordinate, phase.target, least=1.0)
-        self._make_push(pushing, tolerance, _PRESSING)
 
     def _retrace(self, *, whole: bool) -> BasePlacement | None:
         """Return an earlier motion, reversed, that leads on from here or to the target; None without any."""
@@ -427,12 +414,12 @@ class OpeningRun(SkillRun):
         if self.opener.approaches.explain_standing(session.state):
             raise failure  # starts of pushes are elsewhere
         try:
-            pushing, seconds = self._find_push(self._seed + attempt, self.coordinate, self.target)
+            planned = PlannedPush(self.motion, self.coordinate, self.target, self._seed + attempt)
             begun = True
             try:
-                self._make_push(pushing, self.tolerance, seconds)
+                planned.make(self.tolerance)
             except SkillError:
-                if session.fault or self.rest > (1.0 - _LEAST_PUSH / 2) * before:
+                if session.fault or self.rest > (1.0 - LEAST_PUSH / 2) * before:
                     raise
         except SkillError as error:
             if session.fault:
@@ -443,64 +430,3 @@ class OpeningRun(SkillRun):
         finally:
             if self.pushed_from is None and begun:
                 self.pushed_from = value
-
-    def _make_push(self, pushing: Pushing, tolerance: float, seconds: float) -> None:
-        """Go to the start of a push that was found, and push, or raise SkillError."""
-        self.motion.drive()
-        self.motion.follow_planned()
-        outcome = push(
-            self.session,
-            pushing.coordinate,
-            target=pushing.target,
-            tolerance=tolerance,
-            seconds=min(seconds, self.left),
-            pushing=pushing,
-            plan=False,
-            retreat=True,
-        )
-        if self.session.fault or not outcome:
-            raise SkillError(outcome.measures.get("failure", "other"), outcome.reason)
-
-    def _find_push(
-        self, seed: int, coordinate: Symbol, target: float, least: float = _LEAST_PUSH
-    ) -> tuple[Pushing, float]:
-        """Find a push that goes through, or far, with a path to its start; and how long it lasts [s]."""
-        session = self.session
-        session.phase = "place"
-        with session.search(f"starts of a push of '{coordinate}'"):
-            state = session.state
-            try:
-                pushing = Pushing(
-                    self.model,
-                    self.robot,
-                    coordinate,
-                    self.gripper.bodies,
-                    state,
-                    target=target,
-                    dt=session.dt,
-                    fixed=self.gripper.joints,
-                )
-                result = find_push_start(
-                    pushing,
-                    state,
-                    samples=_PUSH_STARTS,
-                    seconds=math.inf,
-                    seed=seed,
-                    least=least,
-                    accept=self._plan_push,
-                    report=session.report_search,
-                )
-            except InvalidValueError as error:
-                raise SkillError("reach", f"It cannot be pushed: {error}") from error
-        if result.state is None:
-            raise SkillError(result.failure, f"Nor does a push: {result.why}")
-        return pushing, math.inf if result.whole else _LONGER * result.steps * session.dt + _AFTER
-
-    def _plan_push(self, start: State) -> str:
-        """Plan the path to the start of a push, and return why there is none."""
-        self.motion.planned = planned = self.opener.approaches.plan(
-            self.session.state, start, seconds=_PLANNING
-        )
-        if planned.trajectory is None:
-            return "no path to the start"
-        return "far away" if planned.trajectory.duration > self.left - _PUSHING else ""
