@@ -24,6 +24,7 @@ COMMANDS: Final = "commands"  # source of speeds
 TRACKER: Final = "tracker"  # source of the believed state
 ACTIVITY: Final = "activity"  # source of what is being done, and why
 LEARNER: Final = "learner"  # source of what is thought of joints
+SUPERVISOR: Final = "supervisor"  # source of how the processes are
 
 TICK: Final = 0.01  # time between two readings of encoders [s]
 TIMEOUT: Final = 0.04  # age of the state of a command from which on the robot stops [s]
@@ -98,6 +99,22 @@ class ActivityNote(msgspec.Struct, array_like=True):
     steps: int = 0  # control steps, in all
     late: int = 0  # those that began late by more than 5 ms, in all
     pairs: list[list[list[str]]] = []  # bodies that the skill means to bring together
+
+
+class ProcessRow(msgspec.Struct, array_like=True):
+    """State of a process of a live system, as its supervisor sees it."""
+
+    name: str  # its command, such as world
+    pid: int  # 0 while there is none
+    state: str  # running, starting, frozen, or how it ended
+    restarts: int = 0
+    cpu: float = math.nan  # share of a core
+
+
+class SupervisorNote(msgspec.Struct, array_like=True):
+    """Note of a supervisor: its processes, in the order in which they were started."""
+
+    rows: list[ProcessRow]
 
 
 class Ask(msgspec.Struct):
