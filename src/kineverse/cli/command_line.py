@@ -75,6 +75,10 @@ COMMANDS: Mapping[str, tuple[str, str]] = MappingProxyType(
         "undo": ("exchange:UNDO", "take back a commit of a served model"),
         "dump": ("exchange:DUMP", "write a backup of a served model, or a document of it"),
         "apply": ("exchange:APPLY", "add the operations of a file to a served model"),
+        "live": (
+            "live_system",
+            "let a robot open and close a kitchen, live: world, estimators, behaviour, page",
+        ),
         "demo": ("demo", "let a robot open and close the doors and drawers of a kitchen"),
     }
 )
