@@ -1,4 +1,4 @@
-"""What the processes of a live system say to each other: vectors, notes beside them, and questions.
+"""Language of the processes of a live system: vectors, notes beside them, and questions.
 
 Numbers go as vectors of state streams, so that everybody can read them; notes say the rest, as msgpack. All
 stamps are times of the robot, which is the clock of the world's computer.
@@ -24,6 +24,7 @@ COMMANDS: Final = "commands"  # source of speeds
 TRACKER: Final = "tracker"  # source of the believed state
 ACTIVITY: Final = "activity"  # source of what is being done, and why
 LEARNER: Final = "learner"  # source of what is thought of joints
+SUPERVISOR: Final = "supervisor"  # source of how the processes are
 
 TICK: Final = 0.01  # time between two readings of encoders [s]
 TIMEOUT: Final = 0.04  # age of the state of a command from which on the robot stops [s]
@@ -83,6 +84,16 @@ class TrackerNote(msgspec.Struct, array_like=True):
     milliseconds: float  # time from a reading to its estimate
 
 
+class SkillResult(msgspec.Struct, array_like=True):
+    """Result of a skill at an object."""
+
+    what: str  # the object's coordinate
+    skill: str  # open or close
+    done: bool
+    reason: str
+    seconds: float = 0.0
+
+
 class ActivityNote(msgspec.Struct, array_like=True):
     """Note of a behaviour: what it does, and why."""
 
@@ -99,6 +110,23 @@ class ActivityNote(msgspec.Struct, array_like=True):
     steps: int = 0  # control steps, in all
     late: int = 0  # those that began late by more than 5 ms, in all
     pairs: list[list[list[str]]] = []  # bodies that the skill means to bring together
+    results: list[SkillResult] = []  # of the last skills
+
+
+class ProcessRow(msgspec.Struct, array_like=True):
+    """State of a process of a live system, as its supervisor sees it."""
+
+    name: str  # its command, such as world
+    pid: int  # 0 while there is none
+    state: str  # running, starting, frozen, or how it ended
+    restarts: int = 0
+    cpu: float = math.nan  # share of a core
+
+
+class SupervisorNote(msgspec.Struct, array_like=True):
+    """Note of a supervisor: its processes, in the order in which they were started."""
+
+    rows: list[ProcessRow]
 
 
 class Ask(msgspec.Struct):
