@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -12,7 +12,7 @@ import numpy.typing as npt
 from kineverse.model.frame_dependence import moved_frames
 from kineverse.state import State
 from kineverse.symbols import Symbol
-from kineverse.worlds import Robot, SimulatedWorld
+from kineverse.worlds import Robot
 from kineverse.worlds.robot_interface import SkillStep
 
 from .auto_camera import TRIAL_HEIGHT, find_extreme_points
@@ -36,6 +36,14 @@ class _Still(NamedTuple):
     way: Floats | None
 
 
+class HasState(Protocol):
+    """Source of the true state, such as a simulated world."""
+
+    @property
+    def state(self) -> State:
+        """True values of all coordinates."""
+
+
 class SkillStills:
     """Stills of a robot that opens and closes objects.
 
@@ -43,7 +51,7 @@ class SkillStills:
     thread draws them while the robot goes on with the next object; its errors are raised by :meth:`draw`.
     """
 
-    def __init__(self, robot: Robot, world: SimulatedWorld | None = None) -> None:
+    def __init__(self, robot: Robot, world: HasState | None = None) -> None:
         self._robot, self._model, self._world = robot, robot.model, world
         self._drawing = RunDrawing(robot.model)
         self._rows: list[Future[list[npt.NDArray[np.uint8]]]] = []

@@ -1,0 +1,552 @@
+"""``kineverse live``: all processes of a live system, supervised, with a table on the terminal."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import os
+import re
+import select
+import shutil
+import socket
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
+from pathlib import Path
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from kineverse.errors import InvalidValueError, KineverseError
+from kineverse.exchange.address import SCHEME, list_servers
+
+from .arguments import require
+from .live import NOISE, WORLDS, ActivityLines, add_noise_option, find_start, parse_noise
+from .output import format_table, join_lines, shorten_text, show_activity
+from .pages import add_page_options, check_picture_path, handle_interrupts
+from .plan_arguments import parse_robot
+
+if TYPE_CHECKING:
+    from kineverse.live.children import Child
+    from kineverse.live.supervisor import LiveRow, LiveStatus, Supervisor
+    from kineverse.manipulation import ArticulatedObject
+    from kineverse.model.model import Model
+    from kineverse.worlds import Robot
+
+HELP = f"""\
+A robot opens and closes the doors and drawers of a kitchen, and then closes whatever is open, also what
+people open, until Ctrl-C. Around a model server run a simulated world in real time, a state estimator, a
+behaviour and a page, each a process; what dies is started again. The terminal shows the processes, what is
+done and why. Keys: e emergency stop, r release, k and a number kill that process, q quit.
+
+With --headless there is no page: one object of each kind is opened and closed, within 90 s, with numbers and
+a picture. The exit status is 0 if all of it was done, else 1. This needs the extras 'exchange', 'control',
+'geometry', a C compiler, for the page 'view', and for --world mujoco 'mjcf'.
+
+examples:
+  kineverse live
+  kineverse live kitchens/17 --robot fetch --world mujoco --noise {NOISE},outliers=0.05
+  kineverse live --do closer --record run.mcap
+  kineverse live --headless --json --picture kitchen.png"""
+
+KITCHEN, ROBOT = "kitchen", "hsr"
+_BRIEF = ("*/oven_door", "*/fridge_door", "*/sink_left_upper_drawer")
+"""Objects without a page, a flap, a door and a drawer, of the kitchen that ships."""
+_KINDS = ("flap", "door", "drawer")  # kinds of which one each is taken in another kitchen
+_DEADLINE = 80.0  # time from the start after which a run without a page ends [s]
+_INTERRUPTED = 130  # exit status after Ctrl-C, as of all commands
+_RUN = "kineverse-live-"  # folders of runs, by the number of the supervisor's process
+_FIRST_PORT, _PORTS = 8080, 100
+_REDRAWN = 0.5  # time between two tables [s]
+_ADDRESS = re.compile(r"https?://\S+")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    from kineverse.live.behaviours import BEHAVIOURS  # for start-up time
+
+    parser.add_argument("kitchen", metavar="KITCHEN", nargs="?", default=KITCHEN, help=f"a model ({KITCHEN})")
+    parser.add_argument(
+        "--robot", metavar="ROBOT[@X,Y,ANGLE]", default=ROBOT, help=f"a robot, and its place ({ROBOT})"
+    )
+    parser.add_argument("--world", choices=WORLDS, default=WORLDS[0], help=f"the world ({WORLDS[0]})")
+    add_noise_option(parser)
+    parser.add_argument("--do", choices=[*BEHAVIOURS], default="tour", help="the behaviour (tour)")
+    parser.add_argument(
+        "--what",
+        nargs="+",
+        metavar="COORDINATE",
+        help="objects by name or pattern ('*_door'), in this order (all; with --headless one of each kind)",
+    )
+    parser.add_argument("--headless", action="store_true", help="numbers and a picture instead of a page")
+    parser.add_argument(
+        "--picture", metavar="PATH", help="write a picture (.png) of what was done at the end"
+    )
+    parser.add_argument("--seconds", type=float, metavar="S", help="end after this time (--headless: 80)")
+    parser.add_argument("--record", metavar="FILE", help="record all (.mcap), for kineverse view")
+    parser.add_argument("--json", action="store_true", help="one JSON object on standard output")
+    parser.add_argument("--name", metavar="NAME", help="name of the model server (live)")
+    parser.add_argument("--seed", type=int, default=0, metavar="N", help="seed of noise and searches (0)")
+    add_page_options(parser)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Run all processes until it is over."""
+    begin = time.monotonic()
+    extras = {
+        "exchange": True,
+        "control": True,
+        "geometry": True,
+        "view": not arguments.headless,
+        "mjcf": arguments.world == "mujoco",
+        "recording": arguments.record is not None,
+    }
+    require("kineverse live", extras, compiler=True)
+    check_picture_path(arguments.picture)
+    parse_noise(arguments.noise)
+    if arguments.seed < 0:
+        raise InvalidValueError(f"--seed is a number from 0 on, not {arguments.seed}.")
+    if arguments.seconds is not None and not 0.0 < arguments.seconds < math.inf:
+        raise InvalidValueError(f"--seconds is a positive number, not {arguments.seconds:g}.")
+    seconds = arguments.seconds or (_DEADLINE if arguments.headless else math.inf)
+    finished = False
+    with handle_interrupts(), ExitStack() as stack:
+        system = LiveSystem(arguments, stack.enter_context(run_folder()))
+        stack.callback(system.close)
+        try:
+            system.start()
+            system.watch(begin + seconds)
+            finished = True
+        finally:
+            system.supervisor.close()  # before the numbers, so that these are of the end
+            system.report()
+    return (0 if system.is_done or not arguments.headless else 1) if finished else _INTERRUPTED
+
+
+@contextmanager
+def run_folder() -> Iterator[Path]:
+    """Yield a folder of this run, and remove those that killed supervisors have left."""
+    parent = Path(tempfile.gettempdir())
+    for left in parent.glob(f"{_RUN}*"):
+        number = left.name.removeprefix(_RUN).partition("-")[0]
+        if number.isdigit() and not _is_alive(int(number)):
+            shutil.rmtree(left, ignore_errors=True)
+    with tempfile.TemporaryDirectory(prefix=f"{_RUN}{os.getpid()}-", ignore_cleanup_errors=True) as folder:
+        yield Path(folder)
+
+
+def _is_alive(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    except OSError:
+        return True
+    return True
+
+
+class LiveSystem:
+    """Processes of a live system, with what is shown of them."""
+
+    def __init__(self, arguments: argparse.Namespace, folder: Path) -> None:
+        from kineverse.live.supervisor import BEHAVE, PAGE, SERVER, TRACK, WORLD, Supervisor
+        from kineverse.manipulation import find_articulated_objects, place_robot
+
+        self._arguments, self._folder = arguments, folder
+        self.name = _choose_name(arguments.name)
+        address = SCHEME + self.name
+        source, place = parse_robot(arguments.robot)
+        serve = ["serve", arguments.kitchen, "--robot", source]
+        store = ["--name", self.name, "--store", str(folder / "model.db")]
+        with show_activity(f"reading {arguments.kitchen} and {source}"):
+            self.model = _load(arguments.kitchen)
+            placed = place_robot(self.model, source)
+            from kineverse.worlds import Robot
+
+            self.robot = Robot.of(self.model, placed.name)
+            find_start(self.model, placed.name, place)  # raises for a place that is none
+            found = find_articulated_objects(self.model, self.robot)
+        self.objects = _choose_objects(found, arguments.what, arguments.headless)
+        self.names = [str(one.coordinate) for one in self.objects]
+        robot = ["--robot", placed.name]
+        noise, seed = ["--noise", arguments.noise], ["--seed", str(arguments.seed)]
+        at = "" if place is None else "@" + ",".join(f"{v!r}" for v in place)
+        world = ["world", address, "--robot", placed.name + at, "--world", arguments.world, *noise, *seed]
+        commands = {
+            SERVER: [*serve, *store],
+            WORLD: [*world, "--kept", str(folder / "world.state")],
+            TRACK: ["track", address, *robot, *noise],
+            BEHAVE: ["behave", address, *robot, *seed, "--do", arguments.do, "--what", *self.names],
+        }
+        if not arguments.headless:
+            host = ["--host", arguments.host] if arguments.host else []
+            quiet = ["--no-browser"] if arguments.no_browser else []
+            commands[PAGE] = ["view", address, "--port", str(_find_port(arguments.port)), *host, *quiet]
+        self.supervisor = Supervisor(self.name, commands, folder, ending=(BEHAVE,), prepare=self._prepare)
+        self._stills: LiveStills | None = None
+        self._stack = ExitStack()
+        self._screen = Screen(self, sys.stderr if arguments.json else sys.stdout)
+
+    def start(self) -> None:
+        """Start all processes."""
+        with show_activity("starting the model server"):
+            self.supervisor.start()
+        if self._arguments.picture or self._arguments.headless:
+            self._stills = LiveStills(self.robot, self.supervisor)
+        if self._arguments.record is not None:
+            from kineverse.live.stream_recorder import StreamRecorder
+
+            connection = self.supervisor.connection
+            about = {"robot": self.robot.name, "world": self._arguments.world, "noise": self._arguments.noise}
+            recorder = StreamRecorder(self._arguments.record, connection, self.model, about)
+            self._stack.enter_context(recorder)
+
+    def watch(self, until: float) -> None:
+        """Watch all processes until a time of the clock that only counts [s], or until all is done."""
+        with self._screen:
+            self.supervisor.run(lambda status: self._look(status) or time.monotonic() > until)
+
+    def _look(self, status: LiveStatus) -> bool:
+        if self._stills is not None:
+            self._stills.look(status)
+        return self._screen.look(status) or (self._arguments.headless and self.is_over)
+
+    def close(self) -> None:
+        """Finish the recording."""
+        self._stack.close()
+
+    def _prepare(self, child: Child, status: LiveStatus) -> None:
+        """Have a behaviour that is started again do what is left, and a page open no second window."""
+        if child.name == "page" and "--no-browser" not in child.words:
+            child.words.append("--no-browser")
+        if child.name != "behaviour" or self._arguments.do == "closer":
+            return
+        left = [name for name in self.names if not self._is_handled(name)]
+        head = child.words[: child.words.index("--do")]
+        do = self._arguments.do if left else "closer"
+        child.words = [*head, "--do", do, "--what", *(left or self.names)]
+
+    @property
+    def _skills(self) -> tuple[str, ...]:
+        """Skills of which the results count."""
+        return {"open": ("open",), "close": ("close",)}.get(self._arguments.do, ("open", "close"))
+
+    def _is_handled(self, name: str) -> bool:
+        return all((name, skill) in self.supervisor.status.results for skill in self._skills)
+
+    @property
+    def is_over(self) -> bool:
+        """Whether there is a result for each object."""
+        return self._arguments.do != "closer" and all(map(self._is_handled, self.names))
+
+    @property
+    def is_done(self) -> bool:
+        """Whether all objects were opened and closed, or what was wanted."""
+        return all(one["done"] for one in self.list_objects())
+
+    def list_objects(self) -> list[dict[str, Any]]:
+        """Return what became of each object, as JSON data."""
+        results, rows = self.supervisor.status.results, []
+        for name in self.names:
+            found = {skill: results.get((name, skill)) for skill in self._skills}
+            missing = next((skill for skill, one in found.items() if one is None), None)
+            wrong = next((one for one in found.values() if one is not None and not one.done), None)
+            reason = wrong.reason if wrong is not None else ""
+            if wrong is None and missing is not None:
+                reason = f"The time was up before it was {'opened' if missing == 'open' else 'closed'}."
+            rows.append(
+                {
+                    "what": name,
+                    "robot": self.robot.name,
+                    "done": not reason,
+                    "reason": join_lines(reason),
+                    "seconds": sum(one.seconds for one in found.values() if one is not None),
+                }
+            )
+        return rows
+
+    def report(self) -> None:
+        """Print what was done, and write the picture."""
+        arguments, status = self._arguments, self.supervisor.status
+        picture = arguments.picture or ("live.png" if arguments.headless else None)
+        if picture is not None and self._stills is not None and self._stills.save(picture):
+            shown: str | None = picture
+        else:
+            shown = None
+        note = status.robot
+        factor = None if note is None else note.factor
+        late = status.late_steps / status.steps if status.steps else None
+        objects = self.list_objects()
+        if arguments.json:
+            data = {
+                "done": self.is_done,
+                "robot": self.robot.name,
+                "world": arguments.world,
+                "noise": arguments.noise,
+                "objects": objects,
+                "steps": status.steps,
+                "late": late,
+                "real_time_factor": factor,
+                "dropped_ticks": None if note is None else note.dropped,
+                "restarts": status.restarts,
+                "picture": shown,
+            }
+            print(json.dumps(data, allow_nan=False), flush=True)
+            return
+        if arguments.headless:
+            rows = [
+                [one["what"], "yes" if one["done"] else "no", f"{one['seconds']:.1f} s", one["reason"]]
+                for one in objects
+            ]
+            print(format_table(("object", "done", "time", "reason"), rows, "<<><"))
+        numbers = [] if factor is None else [f"real-time factor {factor:.4f}"]
+        numbers += [] if late is None else [f"{100 * late:.2f} % of {status.steps} control steps late"]
+        numbers += [f"{status.restarts} restarts"]
+        print(", ".join(numbers), flush=True)
+        if shown is not None:
+            print(f"picture: {shown}", flush=True)
+        if arguments.record is not None:
+            print(f"recording: {arguments.record}", flush=True)
+
+
+def _load(source: str) -> Model:
+    import kineverse as kv  # for start-up time
+
+    if source.startswith(SCHEME):
+        raise InvalidValueError(
+            f"{source} is served already: start the processes around it, see kineverse world --help."
+        )
+    model = kv.Model()
+    model.include(source)
+    return model
+
+
+def _choose_name(wanted: str | None) -> str:
+    """Return the name of the server: the wanted one, or the first that is free."""
+    if wanted is not None:
+        return wanted
+    taken, number = {*list_servers()}, 1
+    while (name := "live" if number == 1 else f"live-{number}") in taken:
+        number += 1
+    return name
+
+
+def _find_port(wanted: int | None) -> int:
+    """Return a port that is free, so that a page that is started again has the same address."""
+    for port in [wanted] if wanted is not None else range(_FIRST_PORT, _FIRST_PORT + _PORTS):
+        with socket.socket() as probe, suppress(OSError):
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            probe.bind(("127.0.0.1", port))
+            return port
+    raise InvalidValueError(f"--port {wanted or _FIRST_PORT}: another process has it.")
+
+
+def _choose_objects(
+    found: Sequence[ArticulatedObject], patterns: Sequence[str] | None, brief: bool
+) -> Sequence[ArticulatedObject]:
+    """Return the objects that are asked for: all but knobs, or briefly one of each kind."""
+    from kineverse.manipulation.articulated_objects import select_objects  # for start-up time
+
+    if patterns is not None:
+        return select_objects(found, patterns)
+    if not brief:
+        return [one for one in found if one.kind != "knob"]
+    with suppress(KineverseError):
+        return select_objects(found, _BRIEF)
+    return [one for kind in _KINDS for one in [one for one in found if one.kind == kind][:1]]
+
+
+class LiveStills:
+    """Stills of what is done, from the streams of a live system."""
+
+    def __init__(self, robot: Robot, supervisor: Supervisor) -> None:
+        from kineverse.state import State  # for start-up time
+        from kineverse.view.skill_stills import SkillStills  # for start-up time
+
+        self._supervisor, self._known = supervisor, {str(s): s for s in robot.model.symbols}
+        self._default = robot.model.default_state()
+        self.state: State = self._default  # the true one
+        self._stills = SkillStills(robot, self)
+        self._drawn: set[str] = set()
+
+    def look(self, status: LiveStatus) -> None:
+        """Keep the present moment, and end the row of an object that was handled."""
+        from kineverse.live.streams import TRACKER, TRUTH  # for start-up time
+
+        note = status.activity
+        truth, belief = self._read(TRUTH), self._read(TRACKER)
+        if note is None or truth is None:
+            return
+        self.state = truth
+        way = np.frombuffer(note.way).reshape(-1, 3) if len(note.way) % 24 == 0 and note.way else None
+        reference = None if way is None else SimpleNamespace(ahead=way)
+        step: Any = SimpleNamespace(state=belief or truth, phase=note.phase, reference=reference)
+        for (what, skill), _ in [*status.results.items()]:
+            if skill == "close" and what not in self._drawn:
+                self._drawn.add(what)
+                self._stills.end_row(self._known[what])
+        if note.doing.startswith(("opens", "closes", "pushes")):
+            self._stills.watch(step, note.doing.startswith("opens"))
+
+    def _read(self, source: str) -> Any:
+        newest = self._supervisor.reader.newest(source)
+        if newest is None:
+            return None
+        named = zip(newest.names, newest.values.tolist(), strict=True)
+        return self._default.updated({self._known[n]: v for n, v in named if n in self._known})
+
+    def save(self, path: str) -> bool:
+        """Write the picture, and return True; False if there is nothing to show."""
+        if not self._stills:
+            return False
+        self._stills.save(path)
+        return True
+
+
+class Screen:
+    """Table of the processes on a terminal, and its keys; elsewhere a line for each change."""
+
+    def __init__(self, system: LiveSystem, stream: Any) -> None:
+        self._system, self._stream = system, stream
+        self._is_terminal = bool(stream.isatty())
+        self._lines = ActivityLines(stream)
+        self._states: dict[str, str] = {}
+        self._address, self._answer, self._kills = "", "", False
+        self._drawn, self._height = -math.inf, 0
+        self._stack = ExitStack()
+
+    def __enter__(self) -> Screen:
+        if self._is_terminal and sys.stdin.isatty():
+            self._stack.enter_context(_single_keys())
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stack.close()
+
+    def look(self, status: LiveStatus) -> bool:
+        """Show the present state; return True if it is to end."""
+        if not self._address:
+            self._find_address()
+        if not self._is_terminal:
+            self._print_changes(status)
+            return False
+        ends = self._read_keys(status)
+        if ends or time.monotonic() - self._drawn >= _REDRAWN:
+            self._drawn = time.monotonic()
+            self._draw(status)
+        return ends
+
+    def _find_address(self) -> None:
+        page = self._system.supervisor.children.get("page")
+        text = "" if page is None or not page.log.is_file() else page.log.read_text("utf-8", "replace")
+        if found := _ADDRESS.search(text):
+            self._address = found[0]
+            if not self._is_terminal:
+                print(self._address, file=self._stream, flush=True)
+
+    def _print_changes(self, status: LiveStatus) -> None:
+        for row in status.rows:
+            before = self._states.get(row.name)
+            if row.state != before and (before is not None or row.state != "starting"):
+                print(f"{row.name}: {row.state}", file=self._stream, flush=True)
+            self._states[row.name] = row.state
+        if status.activity is not None:
+            self._lines.print(status.activity)
+
+    def _draw(self, status: LiveStatus) -> None:
+        width = shutil.get_terminal_size().columns - 1
+        lines = [f"{SCHEME}{self._system.name}   {self._address}".rstrip()]
+        lines += format_table(
+            _HEAD, [_cells(k, row) for k, row in enumerate(status.rows, 1)], _ALIGN, width
+        ).split("\n")
+        lines += describe_status(status)
+        lines.append(self._answer or _KEYS)
+        up = f"\033[{self._height}A" if self._height else ""
+        text = "".join(f"\033[2K{shorten_text(line, width)}\n" for line in lines)
+        below = "\033[J"
+        print(f"{up}\r{text}{below}", end="", file=self._stream, flush=True)
+        self._height = len(lines)
+
+    def _read_keys(self, status: LiveStatus) -> bool:
+        """Do what the keys ask for; return True to end."""
+        if not sys.stdin.isatty():
+            return False
+        supervisor = self._system.supervisor
+        while select.select([sys.stdin], [], [], 0.0)[0]:
+            key = os.read(sys.stdin.fileno(), 1).decode("ascii", "replace")
+            if not key or key == "q":
+                return True
+            if self._kills and key.isdigit():
+                self._kills = False
+                children = [*supervisor.children.values()]
+                if 1 <= int(key) <= len(children):
+                    children[int(key) - 1].kill()
+                    self._answer = f"killed: {children[int(key) - 1].name}"
+                continue
+            self._kills = key == "k"
+            if key == "e":
+                self._answer = supervisor.ask_world("stop") or "Emergency stop: r releases the robot."
+            elif key == "r":
+                self._answer = supervisor.ask_world("release")
+            else:
+                self._answer = "The number of the process to kill?" if self._kills else ""
+        return False
+
+
+_HEAD = ("", "process", "pid", "state", "news", "CPU", "restarts")
+_ALIGN = ">< ><>>>".replace(" ", "")
+_KEYS = "e: emergency stop, r: release, k and a number: kill that process, q: quit"
+
+
+def _cells(number: int, row: LiveRow) -> list[str]:
+    news = "" if math.isnan(row.age) else "-" if math.isinf(row.age) else f"{row.age:.2f} s"
+    cpu = "" if math.isnan(row.cpu) else f"{100 * row.cpu:.0f} %"
+    return [
+        str(number),
+        row.name,
+        str(row.pid or ""),
+        shorten_text(row.state, 60),
+        news,
+        cpu,
+        str(row.restarts),
+    ]
+
+
+def describe_status(status: LiveStatus) -> list[str]:
+    """Return lines on what is done and why, on the world, and on the results."""
+    lines, robot, note = [], status.robot, status.activity
+    if robot is not None:
+        force = "" if math.isnan(robot.force) else f", {robot.force:.0f} N"
+        lines.append(
+            f"{robot.world} world: real-time factor {robot.factor:.4f}, {robot.dropped} ticks dropped, "
+            f"{robot.refused} commands refused{force}"
+        )
+        if robot.stopped:
+            lines.append(f"STOPPED: {robot.stopped}")
+    if note is not None:
+        phase = f" [{join_lines(note.phase)}]" if note.phase else ""
+        lines.append(f"{note.behaviour} {note.doing}: {join_lines(note.why)}{phase}")
+        done = sum(one.done for one in status.results.values())
+        lines.append(f"{done} of {len(status.results)} done. {join_lines(note.last)}")
+    return lines
+
+
+@contextmanager
+def _single_keys() -> Iterator[None]:
+    """Have each key read at once, and not shown."""
+    try:
+        import termios  # not everywhere
+        import tty
+    except ImportError:
+        yield
+        return
+    before = termios.tcgetattr(sys.stdin)
+    tty.setcbreak(sys.stdin)
+    try:
+        yield
+    finally:
+        termios.tcsetattr(sys.stdin, termios.TCSADRAIN, before)
