@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 from kineverse._lazy import lazy_face
 
 if TYPE_CHECKING:
+    from .live_page import LivePage as LivePage
     from .live_robot import LiveBelief as LiveBelief, LiveRobot as LiveRobot
     from .tracker_process import TrackerProcess as TrackerProcess
     from .world_process import WorldProcess as WorldProcess
