@@ -28,6 +28,7 @@ __all__ = [
     "OfflineError",
     "ShapeError",
     "SimulationError",
+    "StoppedError",
     "UnknownAttributeError",
     "UnknownNameError",
     "suggest",
@@ -145,6 +146,10 @@ class FormatError(KineverseError, ValueError):
 
 class SimulationError(KineverseError, RuntimeError):
     """A simulation has come to a state that is not to be trusted; its world has to be reset."""
+
+
+class StoppedError(KineverseError, RuntimeError):
+    """A robot takes no commands until people release it: an emergency stop, or a protective one."""
 
 
 class InfeasibleError(KineverseError, ValueError):

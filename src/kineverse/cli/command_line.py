@@ -60,6 +60,12 @@ COMMANDS: Mapping[str, tuple[str, str]] = MappingProxyType(
         "spheres": ("spheres", "cover collision shapes by spheres, and show how far these stick out"),
         "fit": ("fit", "identify the joint of a part from a table of its poses"),
         "serve": ("serve", "serve a model that other processes read and edit, and keep it"),
+        "world": (
+            "live:WORLD",
+            "run a simulated robot in real time, for a live system around a model server",
+        ),
+        "track": ("live:TRACK", "estimate the state of a live system from what its robot reads and sees"),
+        "behave": ("live:BEHAVE", "let the robot of a live system open and close things, and go on"),
         "keys": ("keys", "make the keys of a model server and its users, for other computers"),
         "relay": ("exchange:RELAY", "relay a site's clients to a model server elsewhere"),
         "ls": ("exchange:LS", "list the model servers of this user"),

@@ -52,8 +52,9 @@ DONE, NOT_DONE = 0, 1
 _COMMON = """
 MODEL is any model or file, ROBOT any shipped robot or robot file; ROBOT@X,Y,ANGLE places it, and
 ROBOT@X,Y,Z,ANGLE one that is bolted to something. The world gets the speeds of the robot alone, and judges by
-its own truth: kinematic (the default), or mujoco with contacts, forces and friction. With --world ros it is a
-robot behind topics of ROS 2, which begins where it is; the result is what it believes. Nothing is moved where
+its own truth: kinematic (the default), or mujoco with contacts, forces and friction. With --world live it is
+the robot of 'kineverse world', and MODEL is live:NAME; with --world ros, one behind topics of ROS 2. Such a
+robot begins where it is, and the result is what it believes. Nothing is moved where
 something is in the way of the object. The exit status is 0 if it is done and nothing went through anything, 1
 if not, 2 if the request is wrong. This needs the extras 'control' and 'geometry', the other world 'mjcf',
 --record 'recording', and opening and closing a C compiler.
@@ -139,8 +140,8 @@ def _add_arguments(parser: argparse.ArgumentParser, skill: str) -> None:
         "--world",
         metavar="WORLD",
         default="kinematic",
-        help="kinematic (the default), mujoco, or ros: a robot behind topics of ROS 2; ros:FILE names its "
-        "settings (.toml)",
+        help="kinematic (the default), mujoco, live: the robot of a live system, whose MODEL is live:NAME, "
+        "or ros: a robot behind topics of ROS 2; ros:FILE names its settings (.toml)",
     )
     parser.add_argument("--from", metavar="VALUE", dest="start", help="value at the start (0.3, 30deg, 12cm)")
     parser.add_argument("--to", metavar="VALUE", help="wanted value")
@@ -212,7 +213,9 @@ def _run_outside(arguments: argparse.Namespace, skill: str) -> int:
         def look(robot: Robot, coordinate: Symbol) -> State:
             nonlocal outside
             outside = stack.enter_context(
-                OutsideRobot(arguments.world, robot, coordinate, whole=arguments.unknown)
+                OutsideRobot(
+                    arguments.world, robot, coordinate, whole=arguments.unknown, server=arguments.model
+                )
             )
             return outside.look()
 
@@ -426,14 +429,21 @@ class _PhaseLines:
 
     def __init__(self, run: _Run) -> None:
         self._run, self._phase = run, ""
+        self._begin: float | None = None
 
     def __call__(self, session: SkillStep) -> None:
+        if self._begin is None:  # a robot outside has the time of the day
+            self._begin = 0.0 if self._run.world is not None else session.time
         if session.phase != self._phase:
             self._phase, scene = session.phase, self._run.scene
             state = session.state if self._run.world is None else self._run.world.state
             value = state.given(scene.coordinate)  # None for a joint that is being learned
             text = "" if value is None else f"{value:.3f} {scene.unit}".rstrip()
-            print(f"{session.time:7.2f} s  {self._phase:<12}  {text}".rstrip(), file=sys.stderr, flush=True)
+            print(
+                f"{session.time - self._begin:7.2f} s  {self._phase:<12}  {text}".rstrip(),
+                file=sys.stderr,
+                flush=True,
+            )
 
 
 def _report_outcome(run: _Run, outcome: JudgedOutcome) -> None:

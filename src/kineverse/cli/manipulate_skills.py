@@ -27,7 +27,8 @@ from kineverse.worlds import RobotInterface, RunMetrics, SimulatedWorld
 
 from .arguments import check_unit, load_model, parse_assignments, parse_value, print_notes
 from .output import join_lines, print_line, show_activity
-from .plan_arguments import parse_robot
+from .outside_robot import is_live
+from .plan_arguments import find_robot_name, parse_robot
 
 if TYPE_CHECKING:
     from kineverse.manipulation import Belief
@@ -73,15 +74,19 @@ def make_scene(
     begin, end = (None if v is None else parse_value(v) for v in (arguments.start, arguments.to))
     source, place = parse_robot(arguments.robot)
     model = load_model(arguments, arguments.model)
-    placed = place_robot(
-        model,
-        source,
-        place,
-        base=arguments.base,
-        root=arguments.root,
-        strict=arguments.strict,
-        loops=arguments.loops,
-    )
+    if is_live(arguments.world):
+        name = find_robot_name(model, source)
+        placed = PlacedRobot(name, Robot.of(model, name).planar_base, {}, name)
+    else:
+        placed = place_robot(
+            model,
+            source,
+            place,
+            base=arguments.base,
+            root=arguments.root,
+            strict=arguments.strict,
+            loops=arguments.loops,
+        )
     lost = remove_unusable_shapes(model)
     more = [f"and {len(lost) - _MOST_NOTES} more"] if len(lost) > _MOST_NOTES else []
     print_notes([f"without this shape: {line}" for line in lost[:_MOST_NOTES]] + more)
@@ -221,6 +226,7 @@ def _find_pusher(robot: Robot, hand: str | None, skill: str) -> tuple[Gripper | 
 
 _PLACEMENT = 60.0  # largest time of the search for a place of the base [s]
 _SHORT = 0.1  # share of a wanted opening that may be missing at the stop of a part whose joint is learned
+LIVE_STEP = 0.01  # time of a step of the robot of a live system [s]
 _BETWEEN_LINES = 1.0  # least time between two lines on the progress of a search [s]
 
 
@@ -396,7 +402,8 @@ class SkillTrial:
                 metrics(session)
             self._look(session)
 
-        return Session(self._interface, belief=self._belief, on_step=look, on_search=_SearchLines())
+        step = {"dt": LIVE_STEP} if is_live(self._arguments.world) else {}
+        return Session(self._interface, belief=self._belief, on_step=look, on_search=_SearchLines(), **step)
 
     def _open_session_at_handle(
         self, metrics: RunMetrics | None, gripper: Gripper, handle: Handle

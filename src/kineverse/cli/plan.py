@@ -23,7 +23,7 @@ from kineverse.worlds import Robot
 
 from .arguments import add_model_options, load_model, needs_mujoco, parse_length, require
 from .output import format_table, join_lines, name_options, show_activity
-from .outside_robot import ConnectedRobot, check_world, connect_robot
+from .outside_robot import ConnectedRobot, check_world, connect_robot, is_live
 from .pages import (
     add_page_options,
     check_picture_path,
@@ -38,6 +38,7 @@ from .plan_arguments import (
     Request,
     add_robot_option,
     choose_coordinates,
+    find_robot_name,
     include_robot,
     make_grip,
     make_hold,
@@ -63,8 +64,9 @@ reached with the hold kept, and bodies of both frames may touch.
 The first plan of a robot takes a while: its shapes are covered by spheres, and code is compiled. Both are
 kept. This needs a C compiler and the extra 'geometry'. The exit status is 1 if no path was found.
 
-With --world ros the path begins where a robot behind topics of ROS 2 is, and the robot follows it; the exit
-status is 1, too, if that is given up.
+With --world ros the path begins where a robot behind topics of ROS 2 is, and the robot follows it; with
+--world live it is the robot of a live system, and MODEL is live:NAME. The exit status is 1, too, if that is
+given up.
 
 examples:
   kineverse plan shelf_door --to shelf_door/door=80deg
@@ -144,8 +146,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="seed of the search (0)")
     parser.add_argument(
         "--world",
-        metavar="ros[:FILE]",
-        help="begin where the robot is, and have it follow the path, by topics of ROS 2 (settings: .toml)",
+        metavar="live|ros[:FILE]",
+        help="begin where the robot is, and have it follow the path: live is that of a live system, whose "
+        "MODEL is live:NAME; ros is by topics of ROS 2 (settings: .toml)",
     )
     parser.add_argument("--save", metavar="FILE", help="write the trajectory to a file (.json)")
     parser.add_argument("--picture", metavar="FILE", help="write a picture (.png) of the motion")
@@ -241,7 +244,9 @@ def _prepare(
         model = load_model(arguments, arguments.model)
         standing: dict[kv.Symbol, float] = {}
         robot = next(iter(model.frames), "").partition("/")[0]
-        if arguments.robot is not None:
+        if is_live(arguments.world):
+            robot = find_robot_name(model, arguments.robot)
+        elif arguments.robot is not None:
             # Whose joints are whose, a robot outside is told by prefixes, as kineverse open does.
             prefix = "" if arguments.world is None else None
             robot, standing = include_robot(arguments, model, prefix)
@@ -303,7 +308,7 @@ def _connect(
         raise InvalidValueError(f"--from {name}: with --world, the robot says itself where it is.")
     if arguments.robot is not None and robot.base is not None and "@" in arguments.robot:
         raise InvalidValueError("--robot ROBOT@X,Y,ANGLE: a robot with a base says itself where it stands.")
-    connected = arguments.opened.enter_context(connect_robot(arguments.world, robot, ()))
+    connected = arguments.opened.enter_context(connect_robot(arguments.world, robot, (), arguments.model))
     return connected, dict(connected.observe().joints)
 
 

@@ -134,6 +134,32 @@ def parse_robot(text: str) -> tuple[str, tuple[float, ...] | None]:
     return source, tuple(parse_value(part) for part in parts)
 
 
+def find_robot_name(model: kv.Model, wanted: str | None) -> str:
+    """Return the prefix of a robot's names in a served model; without a name, of the only one in it."""
+    from kineverse.manipulation.robot_sources import SHIPPED  # for start-up time
+    from kineverse.worlds import Robot  # for start-up time
+
+    heads = dict.fromkeys(s.path.partition("/")[0] for s in model.degrees_of_freedom if "/" in s.path)
+    if wanted in heads:
+        return wanted
+    robots = [head for head in heads if head in SHIPPED or Robot.of(model, head).grippers]
+    if wanted is not None:
+        raise UnknownNameError(
+            f"--robot {wanted}: the served model has none. {suggest(wanted, robots, 'robot')}"
+        )
+    if len(robots) != 1:
+        found = "several robots: " + ", ".join(robots) if robots else "no robot"
+        raise UnknownNameError(
+            f"The served model has {found}. "
+            + (
+                "Name one: --robot ROBOT."
+                if robots
+                else "'kineverse serve MODEL --robot ROBOT' puts one into it."
+            )
+        )
+    return robots[0]
+
+
 def make_hold(model: kv.Model, given: FrameTarget) -> Hold:
     """Return the hold that a target stands for."""
     offset = None

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 from kineverse.errors import InvalidValueError
 from kineverse.exchange.address import Address, split_endpoint
@@ -12,6 +14,10 @@ from kineverse.formats.reader_warnings import collect_warnings
 from .arguments import print_notes, require
 from .output import format_contents, show_activity, truncate_lines
 from .pages import handle_interrupts
+from .plan_arguments import parse_robot
+
+if TYPE_CHECKING:
+    from kineverse.model.model import Model
 
 HELP = """\
 Other processes load the model by its address, edit it, and see each other's edits at once. It is served until
@@ -24,6 +30,7 @@ is read into an empty store only. Without --store, edits end with the server.
 examples:
   kineverse serve kitchen
   kineverse serve kitchen pr2 --name home --store home.db
+  kineverse serve kitchen --robot hsr --name home     for the processes of a live system
   kineverse serve --store home.db                     again, as it was
   kineverse serve --name empty
   kineverse serve kitchen --listen tcp/127.0.0.1:7410         for everybody on this computer
@@ -37,6 +44,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument(
         "models", metavar="MODEL", nargs="*", help="names of shipped models, or paths of files"
+    )
+    parser.add_argument(
+        "--robot",
+        metavar="ROBOT",
+        help="a robot that is put into the model, by name or file, for kineverse world, track and behave",
     )
     parser.add_argument("--name", metavar="NAME", help="name of the server (that of the store, or the model)")
     parser.add_argument("--store", metavar="FILE", help="file that keeps the model and its edits")
@@ -75,8 +87,8 @@ def run(arguments: argparse.Namespace) -> int:
 
     with collect_warnings() as remarks, show_activity("reading the model"):
         server = serve(
-            arguments.models,
-            name=arguments.name,
+            arguments.models if arguments.robot is None else [_load_with_robot(arguments)],
+            name=arguments.name or _choose_name(arguments),
             store=arguments.store,
             listen=arguments.listen,
             durable=arguments.durable,
@@ -106,6 +118,31 @@ def run(arguments: argparse.Namespace) -> int:
         print("\n".join(lines), flush=True)
         server.run()
     return 0
+
+
+def _load_with_robot(arguments: argparse.Namespace) -> Model:
+    """Return all models in one, with the robot next to them."""
+    from kineverse.manipulation import place_robot  # for start-up time
+    from kineverse.model.model import Model  # for start-up time
+
+    source, place = parse_robot(arguments.robot)
+    model = Model()
+    with model.edit() as edit:
+        for one in arguments.models:
+            edit.include(one)
+    if place_robot(model, source, place).place:
+        raise InvalidValueError(
+            f"--robot {arguments.robot}: a robot with a base stands where its world puts it: kineverse world "
+            "live:NAME --robot ROBOT@X,Y,ANGLE."
+        )
+    return model
+
+
+def _choose_name(arguments: argparse.Namespace) -> str | None:
+    """Return the name of the first model, if it is not served as it is and nothing else names the server."""
+    if arguments.robot is None or arguments.store is not None or not arguments.models:
+        return None
+    return Path(arguments.models[0]).name.partition(".")[0] or None
 
 
 def list_addresses(endpoints: Sequence[str], name: str, keys: str | None) -> list[str]:

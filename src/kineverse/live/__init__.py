@@ -6,6 +6,14 @@ from kineverse._lazy import lazy_face
 
 if TYPE_CHECKING:
     from .live_page import LivePage as LivePage
+    from .behaviour_process import BehaviourProcess as BehaviourProcess
+    from .behaviours import (
+        Behaviour as Behaviour,
+        Closer as Closer,
+        CloseByName as CloseByName,
+        OpenByName as OpenByName,
+        Tour as Tour,
+    )
     from .live_robot import LiveBelief as LiveBelief, LiveRobot as LiveRobot
     from .tracker_process import TrackerProcess as TrackerProcess
     from .world_process import WorldProcess as WorldProcess

@@ -8,10 +8,17 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from kineverse.errors import InvalidValueError, KineverseError, OfflineError
+from kineverse.errors import (
+    DuplicateNameError,
+    InvalidValueError,
+    OfflineError,
+    SimulationError,
+    StoppedError,
+)
 from kineverse.exchange import Connection
 from kineverse.exchange.state import Newest
 from kineverse.model.model_view import ModelView
+from kineverse.planning.trajectories.trajectory import Trajectory
 from kineverse.state import State, StateLike
 from kineverse.symbols import Symbol
 from kineverse.worlds import Observation, Robot
@@ -32,11 +39,11 @@ from .streams import (
 )
 
 _CONNECTING = 10.0  # longest time until the first reading [s]
+_FOLLOWING, _BESIDE_PATH = 5.0, 0.1
+"""Gain on a path of joints [1/s], and the distance from it at which it waits [m], [rad]."""
+_SETTLING, _PATIENCE = 0.5, 4.0  # time at the end of such a path, and longest time to wait [s]
+_SILENT = 0.5  # time without a word from a process after which it is named [s]
 _ESTIMATING = 0.004  # longest time that the estimate of a reading is waited for [s]
-
-
-class StoppedError(KineverseError):
-    """The robot takes no commands: an emergency stop, or a protective one."""
 
 
 class LiveRobot:
@@ -55,16 +62,19 @@ class LiveRobot:
     ----------
     planned
         Speeds planned for objects, by name, which the tracker gets with the next command.
-    lateness
-        Times by which readings of the present came later than their stamps say [s], since it was cleared.
 
     Raises
     ------
     OfflineError
-        If no world is there.
+        If no world is there, or one of another version.
+    InvalidValueError
+        If it has another robot.
+    DuplicateNameError
+        If another process sends commands already.
     """
 
     remarks: tuple[str, ...] = ()
+    observed: tuple[str, ...] = ()  # the camera of its world chooses the frames
 
     def __init__(self, model: ModelView, robot: Robot | str, connection: Connection) -> None:
         self.model, self.robot = model, Robot.of(model, robot)
@@ -79,7 +89,14 @@ class LiveRobot:
         self._number, self._picture, self._now = 0, -1, -math.inf
         self.planned: Mapping[str, float] = {}
         self._observation = Observation(-math.inf, {})
-        self._commands = connection.publisher(COMMANDS, self._speeds)
+        try:
+            self._commands = connection.publisher(COMMANDS, self._speeds)
+        except DuplicateNameError:
+            self.reader.close()
+            raise DuplicateNameError(
+                f"Another process commands the robot of '{connection.address}' already ('{COMMANDS}'): end "
+                "it first, or leave the robot to it."
+            ) from None
         try:
             self._connect()
         except BaseException:
@@ -90,13 +107,17 @@ class LiveRobot:
         end = time.monotonic() + _CONNECTING
         while (note := self._read()) is None:
             if time.monotonic() > end:
+                newest = self.reader.newest(ROBOT)
                 raise OfflineError(
                     "No world moves the robot: 'kineverse world' starts one for this model server."
+                    if newest is None
+                    else "The world is of another version than this process: end it, and start it again."
                 )
             self.reader.wait(TICK)
         if missing := [str(s) for s in self.robot.coordinates if s not in self._observation.joints]:
             raise InvalidValueError(
-                f"The world has another robot than '{self.robot.name}': it does not report '{missing[0]}'."
+                f"The world has another robot than '{self.robot.name}': it does not report '{missing[0]}'. "
+                "Name its robot, or start a world with this one."
             )
         self.name, self.timeout = note.world, max(note.timeout, TICK)
 
@@ -114,8 +135,18 @@ class LiveRobot:
         return self._now
 
     @property
+    def problem(self) -> str:
+        """Reason why the robot takes no commands at present; empty if it does."""
+        newest = self.reader.newest(ROBOT)
+        age = math.inf if newest is None else time.monotonic() - newest.arrival
+        if age > _SILENT:
+            return f"The world has said nothing for {age:.1f} s."
+        why = self.stopped
+        return f"The robot is stopped: {why}." if why else ""
+
+    @property
     def stopped(self) -> str:
-        """Why the robot takes no commands at all; empty if it does."""
+        """Reason why people or guards have stopped the robot; empty if they have not."""
         note = self._read()
         return "" if note is None else note.stopped
 
@@ -143,7 +174,34 @@ class LiveRobot:
                 break
             self.reader.wait(left)
         if why := self.stopped:
-            raise StoppedError(why)
+            raise StoppedError(f"The robot is stopped: {why}.")
+
+    def follow(self, trajectory: Trajectory) -> None:
+        """Follow a path of joints, and return at its end.
+
+        Raises
+        ------
+        SimulationError
+            If it is given up, as the robot is too far from the path, or is stopped.
+        """
+        speeds = [s.derivative() for s in trajectory.symbols]
+        time_on_path, moved = 0.0, self.time
+        while time_on_path < trajectory.duration + _SETTLING:
+            joints = self.observe()
+            now = trajectory.positions_at(time_on_path)
+            away = now - np.array([joints.joints[s] for s in trajectory.symbols])
+            off = float(np.abs(away).max(initial=0.0))
+            ahead = time_on_path + TICK if off < _BESIDE_PATH else time_on_path  # it waits
+            rates = (trajectory.positions_at(ahead) - now) / TICK + _FOLLOWING * away
+            try:
+                self.apply(dict(zip(speeds, rates.tolist(), strict=True)), TICK, stamp=joints.stamp)
+            except StoppedError as error:
+                raise SimulationError(str(error)) from None
+            if ahead > time_on_path:
+                time_on_path, moved = ahead, self.time
+            elif self.time - moved > _PATIENCE:
+                raise SimulationError(f"The robot is {off:.2g} (m or rad) from its path.")
+        self.apply({}, TICK)
 
     def observe(self) -> Observation:
         """Return the latest sensor readings that have arrived."""
@@ -178,6 +236,17 @@ class LiveBelief:
         self._deviations: dict[Symbol, float] = {}
         self._note: TrackerNote | None = None
         self.seen: dict[Symbol, float] = {}
+
+    @property
+    def problem(self) -> str:
+        """Reason why nothing is believed at present; empty if the tracker goes on."""
+        newest = self._robot.reader.newest(TRACKER)
+        if newest is None:
+            return "No tracker says where things are: 'kineverse track' starts one."
+        if decode(newest.note, TrackerNote) is None:
+            return "The tracker is of another version than this process: end it, and start it again."
+        age = time.monotonic() - newest.arrival
+        return f"The tracker has said nothing for {age:.1f} s." if age > _SILENT else ""
 
     @property
     def lost(self) -> tuple[str, ...]:

@@ -1,4 +1,4 @@
-"""What the processes of a live system say to each other: vectors, notes beside them, and questions.
+"""Language of the processes of a live system: vectors, notes beside them, and questions.
 
 Numbers go as vectors of state streams, so that everybody can read them; notes say the rest, as msgpack. All
 stamps are times of the robot, which is the clock of the world's computer.
@@ -83,6 +83,16 @@ class TrackerNote(msgspec.Struct, array_like=True):
     milliseconds: float  # time from a reading to its estimate
 
 
+class SkillResult(msgspec.Struct, array_like=True):
+    """Result of a skill at an object."""
+
+    what: str  # the object's coordinate
+    skill: str  # open or close
+    done: bool
+    reason: str
+    seconds: float = 0.0
+
+
 class ActivityNote(msgspec.Struct, array_like=True):
     """Note of a behaviour: what it does, and why."""
 
@@ -99,6 +109,7 @@ class ActivityNote(msgspec.Struct, array_like=True):
     steps: int = 0  # control steps, in all
     late: int = 0  # those that began late by more than 5 ms, in all
     pairs: list[list[list[str]]] = []  # bodies that the skill means to bring together
+    results: list[SkillResult] = []  # of the last skills
 
 
 class ProcessRow(msgspec.Struct, array_like=True):

@@ -29,6 +29,8 @@ from .streams import (
     encode,
 )
 
+_SILENT = 2.0  # time without a word from the world after which it is named [s]
+
 
 class TrackerProcess:
     """Tracker that publishes a believed state for each reading of the robot.
@@ -60,11 +62,29 @@ class TrackerProcess:
     def _list_symbols(self) -> list[Symbol]:
         return [s for s in self._follower.value.model.symbols if not s.order]
 
-    def run(self, is_over: Callable[[], bool] = lambda: False) -> None:
-        """Track until it is over."""
+    def run(
+        self,
+        is_over: Callable[[], bool] = lambda: False,
+        on_problem: Callable[[str], object] = lambda _: None,
+    ) -> None:
+        """Track until it is over; what prevents it is told once."""
+        told = ""
         while not is_over():
             if self._reader.wait(0.1):
                 self.step()
+            if (problem := self.find_problem()) != told:
+                told = problem
+                if problem:
+                    on_problem(problem)
+
+    def find_problem(self) -> str:
+        """Return why nothing can be tracked; empty if there are readings."""
+        newest = self._reader.newest(ROBOT)
+        if newest is None or time.monotonic() - newest.arrival > _SILENT:
+            return "There are no readings: no world runs, or it is frozen."
+        if decode(newest.note, RobotNote) is None:
+            return "The world is of another version than this process: end it, and start it again."
+        return ""
 
     def step(self) -> bool:
         """Publish the state of the newest readings; return False if there are none that are newer."""

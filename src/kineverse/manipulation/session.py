@@ -20,7 +20,14 @@ import numpy as np
 
 from kineverse._checks import as_positive, finite_number
 from kineverse.control import Command
-from kineverse.errors import InvalidValueError, ShapeError, SimulationError, UnknownNameError, suggest
+from kineverse.errors import (
+    InvalidValueError,
+    ShapeError,
+    SimulationError,
+    StoppedError,
+    UnknownNameError,
+    suggest,
+)
 from kineverse.expressions import Expression
 from kineverse.lie import Array
 from kineverse.model.model_view import ModelView
@@ -471,6 +478,9 @@ class Session:
             self.commands = {}
             self.fault = self.broken = f"The robot '{name}' has not answered for {error} s."
             raise SkillError("other", self.broken) from None
+        except StoppedError as error:  # until it is released
+            self.fault = str(error)
+            raise SkillError("other", self.fault) from error
         except SimulationError as error:
             self.fault = self.broken = str(error)
             raise SkillError("other", self.broken) from error
