@@ -168,7 +168,8 @@ def run(arguments: argparse.Namespace) -> int:
         if find_scheme(arguments.model) is not None and arguments.robot is None:
             from kineverse.live import LivePage  # for start-up time
 
-            os.nice(_NICENESS)  # whoever controls the robot comes first
+            # Whoever controls the robot comes first; threads that are there answer the emergency stop.
+            os.nice(_NICENESS)
             stack.enter_context(LivePage(page, model))
         print_address(page, browser=not arguments.no_browser)
         print(recording or model, flush=True)

@@ -5,7 +5,6 @@ from typing import TYPE_CHECKING
 from kineverse._lazy import lazy_face
 
 if TYPE_CHECKING:
-    from .live_page import LivePage as LivePage
     from .behaviour_process import BehaviourProcess as BehaviourProcess
     from .behaviours import (
         Behaviour as Behaviour,
@@ -14,6 +13,7 @@ if TYPE_CHECKING:
         OpenByName as OpenByName,
         Tour as Tour,
     )
+    from .live_page import LivePage as LivePage
     from .live_robot import LiveBelief as LiveBelief, LiveRobot as LiveRobot
     from .tracker_process import TrackerProcess as TrackerProcess
     from .world_process import WorldProcess as WorldProcess

@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import threading
 import time
+from collections.abc import Callable
 from typing import Any, Final
 
 import msgspec
@@ -20,6 +21,7 @@ from kineverse.exchange.state import StateReader
 from .streams import ROBOT, RobotNote, ask, decode
 
 _ANSWER = 1.0  # longest time until the world answers [s]
+_NEWS = 0.1  # longest time until the robot's news say what has been done [s]
 _SILENT = 0.5  # age of the robot's news from which on nobody knows what it does [s]
 _HEARD = 2.5  # time for which a browser counts as one that looks [s]
 
@@ -60,13 +62,16 @@ class EmergencyStop:
         with self._lock:
             self.wanted, self._is_confirmed = True, False
         self._send_stop()
+        if self._is_confirmed:
+            self._wait_until(lambda note: bool(note.stopped))
         return self.state
 
     def release(self) -> RobotState:
         """Let the robot take commands again."""
         with self._lock:
             self.wanted = False
-        self._ask("release")
+        if self._ask("release"):
+            self._wait_until(lambda note: not note.stopped)
         return self.state
 
     def watch(self) -> None:
@@ -128,6 +133,12 @@ class EmergencyStop:
             self._problem = str(error)
         return not self._problem
 
+    def _wait_until(self, is_so: Callable[[RobotNote], bool]) -> None:
+        """Wait for a moment until the robot's news say so, for the answer to the browser."""
+        end = time.monotonic() + _NEWS
+        while (note := self._read()[0]) is not None and not is_so(note) and time.monotonic() < end:
+            self._reader.wait(_NEWS)
+
     def _read(self) -> tuple[RobotNote | None, float]:
         newest = self._reader.newest(ROBOT)
         if newest is None:
@@ -162,7 +173,7 @@ OVERLAY: Final = """
   const box = document.getElementById("kineverse-stop");
   const [button, release, line] = ["stop", "release", "line"].map(name => box.querySelector("." + name));
   const base = location.pathname.replace(/\\/$/, "") + "/robot/";
-  let frames = 0, begin = performance.now();
+  let frames = 0, begin = performance.now(), wanted = false;
   const count = () => { frames += 1; requestAnimationFrame(count); };
   requestAnimationFrame(count);
   const ask = async what => {
@@ -171,9 +182,10 @@ OVERLAY: Final = """
     if (passed > .3) { frames = 0; begin = performance.now(); }
     try {
       const answer = await fetch(base + what, {
-        headers: {"X-Kineverse": rate}, cache: "no-store", signal: AbortSignal.timeout(4000)});
+        headers: {"X-Kineverse": rate}, cache: "no-store", signal: AbortSignal.timeout(6000)});
       if (!answer.ok) throw new Error();
       const state = await answer.json();
+      if (what === "stop") wanted = false;
       box.className = state.stopped ? "stopped" : "";
       box.style.display = state.robot ? "block" : "none";
       button.textContent = state.stopped ? "STOPPED" : "EMERGENCY STOP";
@@ -181,12 +193,16 @@ OVERLAY: Final = """
     } catch {
       box.className = "lost";
       button.textContent = "NO CONNECTION";
-      line.textContent = "This page does not reach the robot. Stop it elsewhere.";
+      line.textContent = "This page does not reach the robot. " +
+        (wanted ? "It goes on asking for a stop." : "Stop it elsewhere.");
     }
   };
-  const poll = async () => { if (!document.hidden) await ask("state"); setTimeout(poll, 1000); };
-  button.onclick = () => { button.textContent = "STOPPING"; ask("stop"); };
-  release.onclick = () => ask("release");
+  const poll = async () => {
+    if (wanted || !document.hidden) await ask(wanted ? "stop" : "state");
+    setTimeout(poll, 1000);
+  };
+  button.onclick = () => { wanted = true; button.textContent = "STOPPING"; ask("stop"); };
+  release.onclick = () => { wanted = false; ask("release"); };
   poll();
 })();
 </script>

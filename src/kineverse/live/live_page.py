@@ -32,11 +32,13 @@ from .live_status import HEAD, describe_all, list_processes
 from .people_panel import Choices, PeoplePanel
 from .streams import (
     ACTIVITY,
+    LEARNER,
     ROBOT,
     SUPERVISOR,
     TRACKER,
     TRUTH,
     ActivityNote,
+    LearnerNote,
     SupervisorNote,
     read_note,
 )
@@ -232,7 +234,8 @@ class LivePage(Closing):
         ]
         self._run.show_table(HEAD, rows)
         names = [] if note is None else [row.name for row in note.rows if row.pid]
-        self._people.update(truth, names, ())
+        learner = read_note(self.reader, LEARNER, LearnerNote)
+        self._people.update(truth, names, [] if learner is None else [row.tag for row in learner.proposals])
 
 
 def _emphasize(lines: Sequence[str]) -> list[str]:

@@ -18,6 +18,7 @@ from .streams import (
     TRACKER,
     TRUTH,
     ActivityNote,
+    LearnerNote,
     ProcessRow,
     RobotNote,
     SupervisorNote,
@@ -120,7 +121,7 @@ def describe_activity(note: ActivityNote | None) -> list[str]:
     if note is None:
         return ["nothing is done: no behaviour is there"]
     lines = [f"{note.behaviour}: {note.doing}" if note.doing else note.behaviour]
-    lines += [f"because {note.why}"] if note.why else []
+    lines += [f"why: {note.why}"] if note.why else []
     if note.done or note.failed:
         lines.append(f"so far {note.done} done, {note.failed} failed")
     return lines + ([f"last: {note.last}"] if note.last else [])
@@ -149,6 +150,20 @@ def describe_tracker(tracker: TrackerNote | None, now: float) -> list[str]:
     return [f"{what}: {_name(names)}" for what, names in (("lost", lost), ("unseen", unseen)) if names]
 
 
+def describe_learner(learner: LearnerNote | None) -> list[str]:
+    """Return lines about what is learned, what is doubted, and what is proposed."""
+    if learner is None:
+        return []
+    lines = [f"learner: {learner.problem}"] if learner.problem else []
+    for part in learner.watched:
+        sure = "" if not part.family else f", {part.family} with {part.probability:.0%}"
+        lines.append(f"learns {part.frame}: {part.state}{sure}")
+    lines += [f"implausible: {tag}: {why}" for tag, why in learner.alarms.items()]
+    for row in learner.proposals:
+        lines.append(f"proposed: {row.what}" + (f" (waits for {row.waits})" if row.waits else ""))
+    return [*lines, f"learned last: {learner.last}"] if learner.last else lines
+
+
 def describe_all(reader: StateReader) -> list[str]:
     """Return all lines about the streams of a reader."""
     newest = reader.newest(ROBOT)
@@ -156,7 +171,7 @@ def describe_all(reader: StateReader) -> list[str]:
     lines = describe_activity(activity) + describe_robot(robot, activity)
     if newest is not None:
         lines += describe_tracker(read_note(reader, TRACKER, TrackerNote), newest.stamp)
-    return lines
+    return lines + describe_learner(read_note(reader, LEARNER, LearnerNote))
 
 
 def _share(part: int, whole: int) -> str:
