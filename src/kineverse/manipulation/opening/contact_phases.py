@@ -192,6 +192,15 @@ class PhasePlanner:
         way = Way.straight(first.coordinate, state[first.coordinate], first.target)
         return ContactPhase(first.coordinate, first.target, tolerance, handle, way)
 
+    def latches(self, state: State, target: float) -> bool:
+        """Return True if the object does not move back from a target unless something unlatches it."""
+        if not self.has_keys:
+            return False
+        default = self._model.default_state()
+        there = state.updated({s: default[s] for s in self._objects} | {self.coordinate: target})
+        plan = self._plan(there, float(state[self.coordinate]), ())
+        return plan.verdict == "found" and any(step.coordinate != self.coordinate for step in plan.steps)
+
     def find_straight(self, state: State, target: float) -> Way:
         """Return the way on which the object alone moves."""
         here = state[self.coordinate]

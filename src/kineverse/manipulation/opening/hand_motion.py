@@ -442,8 +442,8 @@ beyond some [m/s], [rad/s] for it either: its own constraints hold it."""
 _STEPS_AT_TARGET = 10  # number of steps for which an estimate is at the target when a motion ends
 
 
-def move_held(motion: HandMotion, placement: BasePlacement, tolerance: float) -> None:
-    """Move a held object along the path of a placement."""
+def move_held(motion: HandMotion, placement: BasePlacement, tolerance: float, near: float) -> None:
+    """Move a held object along the path of a placement, near to its end, or to rest within a tolerance."""
     bar, hand = motion.bar, motion.hand
     session, way, grasp = motion.session, placement.way, placement.grasp
     assert grasp is not None
@@ -480,7 +480,7 @@ def move_held(motion: HandMotion, placement: BasePlacement, tolerance: float) ->
     within, enough = 0, _STEPS_AT_TARGET if session.deviation(coordinate) else 1
     while True:
         rest = abs(session.state[coordinate] - target)
-        there = rest <= tolerance / 4 and (share == 1.0 or len(coordinates) == 1)
+        there = rest <= near and (share == 1.0 or len(coordinates) == 1)
         within = within + 1 if there else 0
         if within >= enough:
             return
