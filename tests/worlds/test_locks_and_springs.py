@@ -17,14 +17,6 @@ World = KinematicWorld | MujocoWorld
 both = pytest.mark.parametrize("kind", [KinematicWorld, MujocoWorld])
 
 
-def heavy_pusher() -> kv.Model:
-    """A hand of 20 kg, strong enough to pull, and a drawer with a lock."""
-    model = pusher(locked=True)
-    with model.edit() as edit:
-        edit.apply(SetBody("robot/base", Body(inertia=Inertia(20.0, (0.4, 0, 0, 0.4, 0, 0.4)))))
-    return model
-
-
 def finger_before(mechanism: kv.articulations.Mechanism, at: tuple[float, float, float]) -> kv.Model:
     """A ball of 1 cm that moves along x, at first at some place before a mechanism."""
     model = kv.Model()
@@ -52,7 +44,7 @@ def run(world: World, seconds: float, **speeds: float) -> None:
 
 @both
 def test_a_locked_drawer_is_not_pulled_open_and_an_unlocked_one_is(kind: type[World]) -> None:
-    model = heavy_pusher()
+    model = pusher(locked=True, mass=20.0)
     world = kind(model, "robot", gripper(model))
     assert not any("room/drawer/lock" in remark for remark in world.remarks)
     before = {"robot/x": 0.88, "robot/z": 2.0, "robot/finger": 0.05}
@@ -66,7 +58,7 @@ def test_a_locked_drawer_is_not_pulled_open_and_an_unlocked_one_is(kind: type[Wo
 
 
 @both
-def test_a_lever_snaps_back_and_the_door_that_it_locks_is_free_to_shut_alone(kind: type[World]) -> None:
+def test_a_lever_snaps_back_and_then_the_door_can_be_shut_alone(kind: type[World]) -> None:
     mechanism = kv.articulations.DoorWithHandle(name="room", parent="world")
     model = finger_before(mechanism, (0.0, 0.5, 1.5))
     world = kind(model, "robot", None)
@@ -75,12 +67,10 @@ def test_a_lever_snaps_back_and_the_door_that_it_locks_is_free_to_shut_alone(kin
     run(world, 0.5)
     assert world.state["room/handle"] == pytest.approx(0.0, abs=1e-3)
     assert world.state["room/door"] == pytest.approx(0.1, abs=1e-3)
-    # From behind, a finger opens it further, from the front it shuts it, and then it is locked.
-    world.reset(ajar | {"robot/x": -0.2})
+    # A finger shuts it from the front. Then it is locked: one behind it does not push it open.
     run(world, 2.6, x=0.1)
-    shut = world.state["room/door"]
-    assert shut == pytest.approx(0.0, abs=1e-3)
-    world.reset({"room/door": 0.0, "room/handle": 0.7, "robot/x": 0.05})
+    assert world.state["room/door"] == pytest.approx(0.0, abs=1e-3)
+    world.reset({"room/handle": 0.7, "robot/x": 0.05})
     run(world, 0.5)
     run(world, 1.0, x=-0.05)
     assert world.state["room/door"] == pytest.approx(0.0, abs=1e-3)

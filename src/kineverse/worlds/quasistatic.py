@@ -57,6 +57,7 @@ from .quasistatic_constraints import (
     project_twists,
 )
 from .robot import Robot
+from .simulated_world import DEEPER
 
 SKIN = 1e-6  # gap to which objects are pushed [m]: below, normals of nearest points are not determined
 _REACH = 0.005  # distance beyond the robot's motion up to which gaps are rows [m]
@@ -194,6 +195,29 @@ class ObjectMotion:
         pairs, index = self.find_near(0.0)
         keys = pair_keys(pairs) if len(index) else []
         self._before = {keys[k]: float(pairs.distances[k]) for k in index.tolist()}
+
+    def displace(self, q: Array) -> tuple[str, str] | None:
+        """Move objects to a configuration, unless that leads into a body: then return the two bodies."""
+        self.settle()
+        start, before = self.q.copy(), self._find_meeting()
+        self.place(q)
+        pairs, index = self.find_near(0.0)
+        keys = pair_keys(pairs) if len(index) else []
+        for k in index.tolist():
+            if pairs.distances[k] < self._before.get(keys[k], 0.0) - DEEPER[0]:
+                self.place(start)
+                return pairs[k].a, pairs[k].b
+        for pair, depth in self._find_meeting().items():
+            if depth > before.get(pair, 0.0) + DEEPER[1]:
+                self.place(start)
+                return pair
+        self.settle()
+        return None
+
+    def _find_meeting(self) -> dict[tuple[str, str], float]:
+        """Return the depths of furniture in furniture by pair of bodies [m]."""
+        found = reversed(self.overlaps.find_beyond(0.0))
+        return {(one.a, one.b): -one.distance - allowed for one, allowed in found}
 
     def find_near(self, radius: float) -> tuple[DistanceResults, npt.NDArray[np.intp]]:
         """Return the pairs within a radius [m], and the indices of those that are not ignored."""
