@@ -62,6 +62,23 @@ def add_noise_option(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--noise", metavar="TEXT", default=NOISE, help=f"sensors, or none ({NOISE})")
 
 
+def add_far_option(parser: argparse.ArgumentParser) -> None:
+    """Declare how far things are opened."""
+    parser.add_argument(
+        "--far",
+        type=float,
+        default=1.0,
+        metavar="SHARE",
+        help="share of the way by which they are opened (1)",
+    )
+
+
+def check_far(far: float) -> None:
+    """Check ``--far``."""
+    if not 0.1 <= far <= 1.0:
+        raise InvalidValueError(f"--far is a share of the way between 0.1 and 1, not {far:g}.")
+
+
 def parse_noise(text: str) -> Sensors:
     """Return the sensors of ``--noise``."""
     from kineverse.worlds import Sensors  # for start-up time
@@ -266,6 +283,7 @@ def _add_behave_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--what", nargs="+", metavar="COORDINATE", help="objects by name or pattern ('*_door') (all)"
     )
+    add_far_option(parser)
     parser.add_argument("--hand", metavar="FRAME", help="hand of the robot (the likeliest gripper)")
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="seed of all searches (0)")
     parser.add_argument(
@@ -279,6 +297,7 @@ def _run_behave(arguments: argparse.Namespace) -> int:
         raise InvalidValueError(f"--do {arguments.do} is about objects by name: --what COORDINATE.")
     if arguments.seed < 0:
         raise InvalidValueError(f"--seed is a number from 0 on, not {arguments.seed}.")
+    check_far(arguments.far)
     from kineverse.live import BehaviourProcess  # for start-up time
     from kineverse.live.behaviours import BEHAVIOURS  # for start-up time
     from kineverse.planning.bindings import request_planner  # for start-up time
@@ -295,7 +314,12 @@ def _run_behave(arguments: argparse.Namespace) -> int:
                 lines.print(note)
 
             return BEHAVIOURS[arguments.do](
-                sessions, patterns=arguments.what, report=report, hand=arguments.hand, seed=arguments.seed
+                sessions,
+                patterns=arguments.what,
+                report=report,
+                hand=arguments.hand,
+                seed=arguments.seed,
+                far=arguments.far,
             )
 
         with explain_twice("behaviour", arguments.server):

@@ -73,11 +73,13 @@ class Task:
     opening: bool
     why: str
     by_push: bool = False
+    far: float = 1.0  # share of the whole way by which it is opened
 
     @property
     def target(self) -> float:
         """Wanted value of the coordinate [m], [rad]."""
-        return self.object.opened if self.opening else self.object.shut
+        shut, opened = self.object.shut, self.object.opened
+        return shut + self.far * (opened - shut) if self.opening else shut
 
     def __str__(self) -> str:
         verb = "opens" if self.opening else "pushes" if self.by_push else "closes"
@@ -111,6 +113,8 @@ class Behaviour:
         Longest time of a skill [s].
     seed
         Seed of all searches.
+    far
+        Share of the whole way by which things are opened.
 
     Attributes
     ----------
@@ -132,7 +136,9 @@ class Behaviour:
         hand: str | None = None,
         seconds: float = 90.0,
         seed: int = 0,
+        far: float = 1.0,
     ) -> None:
+        self._far = far
         self._sessions, self._report, self._hand = sessions, report, hand
         self._patterns = None if patterns is None else tuple(patterns)
         self._seconds, self.seed = seconds, seed
@@ -474,9 +480,8 @@ class Agenda(Closer):
         one = self.scene.names.get(name)
         if one is None:
             return self._give_up(None, "The model has it no longer.")
-        task = Task(
-            one, opening, "It was asked for." if not self._tries else f"This is try {self._tries + 1}."
-        )
+        why = "It was asked for." if not self._tries else f"This is try {self._tries + 1}."
+        task = Task(one, opening, why, far=self._far)
         if why := self.scene.find_unseen(session, one):
             if self._unseen_since < 0.0:
                 self._unseen_since = session.time
