@@ -13,6 +13,7 @@ if TYPE_CHECKING:
         OpenByName as OpenByName,
         Tour as Tour,
     )
+    from .live_page import LivePage as LivePage
     from .live_robot import LiveBelief as LiveBelief, LiveRobot as LiveRobot
     from .tracker_process import TrackerProcess as TrackerProcess
     from .world_process import WorldProcess as WorldProcess

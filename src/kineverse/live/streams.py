@@ -39,6 +39,7 @@ class RobotNote(msgspec.Struct, array_like=True):
     touching: list[str]  # frames whose touch sensors report
     stopped: str = ""  # why the robot takes no commands at all; empty if it does
     force: float = math.nan  # largest force between the robot and another body [N]
+    commanded: float = 0.0  # largest of the speeds that act, without fingers [m/s], [rad/s]
     refused: int = 0  # commands that were too old, in all
     late: int = 0  # ticks that began late by more than half of one, in all
     dropped: int = 0  # ticks that were left out, in all
@@ -126,6 +127,38 @@ class SupervisorNote(msgspec.Struct, array_like=True):
     """Note of a supervisor: its processes, in the order in which they were started."""
 
     rows: list[ProcessRow]
+
+
+class WatchedPart(msgspec.Struct, array_like=True):
+    """Part whose joint is unknown, and what is thought of it."""
+
+    frame: str
+    parent: str  # frame relative to which it is watched
+    state: str  # waits, moves, hidden, sure or written
+    family: str = ""  # most probable kind of joint; empty before there is one
+    probability: float = math.nan
+    way: float = 0.0  # motion from where it stood [m]
+    turn: float = 0.0  # the same [rad]
+    poses: int = 0  # number of poses that were learned from
+
+
+class ProposalRow(msgspec.Struct, array_like=True):
+    """Operation that the learner would write."""
+
+    tag: str
+    what: str  # in words
+    waits: str = ""  # what it waits for: a time, the server, or to be accepted
+
+
+class LearnerNote(msgspec.Struct, array_like=True):
+    """Note of a learner. The question ``accept`` (tag) has a proposal written."""
+
+    watched: list[WatchedPart] = []
+    alarms: dict[str, str] = {}  # why a part of the model is implausible, by its tag
+    proposals: list[ProposalRow] = []
+    edits: int = 0  # that were written, in all
+    last: str = ""  # what was written last, or why it was not
+    problem: str = ""  # why nothing is learned at all, such as a camera that sees nothing
 
 
 class Ask(msgspec.Struct):

@@ -40,7 +40,6 @@ from .streams import (
 )
 
 _LATE = 0.005  # time after which a tick counts as late [s]
-_TRUTH_TICKS = 3  # ticks between two true states
 _KEPT_TICKS = 10  # ticks between two states in the file
 EMERGENCY = "emergency stop"
 
@@ -90,6 +89,7 @@ class WorldProcess:
         self._ticks = self._late = self._dropped = self._refused = self._picture = 0
         self._command: tuple[float, int] = (-math.inf, -1)  # the last one that was counted as too old
         self._fingers: dict[str, float] = {}
+        self._commanded = 0.0
         self._begin(self._restore(start))
         self._reader = live.exchange.reader()
         handlers: dict[str, Handler] = {"stop": self.stop, "release": self.release, "move": self._move}
@@ -142,7 +142,9 @@ class WorldProcess:
     def tick(self, now: float) -> None:
         """Advance by one tick to a time [s], and publish the readings."""
         self._follow()
-        self.world.apply(self._choose_speeds(now), TICK)
+        speeds = self._choose_speeds(now)
+        self._commanded = max((abs(v) for s, v in speeds.items() if s not in self._finger_names), default=0.0)
+        self.world.apply(speeds, TICK)
         self._ticks += 1
         self._publish(now)
         if self._kept is not None and self._ticks % _KEPT_TICKS == 0:
@@ -179,15 +181,15 @@ class WorldProcess:
         passed = time.monotonic() - self._first
         note = RobotNote(
             world.name, self._timeout, sorted(observation.touching), self.stopped, world.peak_force,
-            self._refused, self._late, self._dropped, self._ticks, self._ticks * TICK / max(passed, TICK),
+            self._commanded, self._refused, self._late, self._dropped, self._ticks,
+            self._ticks * TICK / max(passed, TICK),
         )  # fmt: skip
         self._robot.put([observation.joints[s] for s in coordinates], stamp, encode(note))
         if observation.poses:
             self._picture += 1
             shown = CameraNote.make(self._picture, observation.poses)
             self._camera.put((), now + observation.picture_stamp - world.time, encode(shown))
-        if self._ticks % _TRUTH_TICKS == 0:
-            self._truth.put(world.state.vector(self._symbols), now)
+        self._truth.put(world.state.vector(self._symbols), now)
 
     # -- edits, and what is kept -----------------------------------------------------------------------------
 

@@ -53,8 +53,11 @@ class JointLearning:
         """Number of poses so far."""
         return len(self._identifier)
 
-    def add(self, pose: Array, covariance: Array) -> None:
-        """Add a pose (4, 4) of the part relative to what it moves in, with its covariance (6, 6)."""
+    def add(self, pose: Array, covariance: Array | None = None) -> None:
+        """Add a pose (4, 4) of the part relative to what it moves in.
+
+        All poses have a covariance (6, 6), or none has, and the noise is estimated.
+        """
         self._identifier.add(None, pose, child_covariance=covariance)
 
     def update(self, distance: float, turn: float, time: float) -> bool:

@@ -13,9 +13,10 @@ from kineverse.articulations import Fixed, Floating
 from kineverse.compilation import compile
 from kineverse.errors import InvalidValueError, UnknownNameError, suggest
 from kineverse.estimation import Fit
+from kineverse.estimation.identification.families import GroupMotion
 from kineverse.grasping import Handle, find_handle
 from kineverse.grasping.finger_branches import path_to_root
-from kineverse.lie import Array, inverse, log_se3, pose_difference, to_quaternion
+from kineverse.lie import Array, exp_so3, inverse, log_se3, pose_difference, to_quaternion, transform
 from kineverse.model.articulation import Articulation
 from kineverse.model.body import Pose
 from kineverse.model.frame import WORLD
@@ -156,6 +157,26 @@ def write_joint(model: Model, frame: str, fit: Fit, parent: str) -> Symbol:
             edit.attach(frame, child, translation(0, 0, 0))
     (coordinate,) = model.fk(frame, parent).symbols
     return coordinate
+
+
+def align_fit(fit: Fit, zero: Array, ahead: Array) -> Fit:
+    """Return an identified joint whose value is 0 where its part is nearest to a pose (4, 4), and positive ahead.
+
+    Identified values are about their mean. With this zero, a part that was shut is shut at 0 in each new fit.
+    A curve, and a joint of several coordinates, stays as it is.
+    """
+    motion = fit.motion
+    if not isinstance(motion, GroupMotion) or motion.joints != 1:
+        return fit
+    path = JointPath.of_fit(fit, zero)
+    shift, values = path.value, fit.joint_values - path.value
+    turn = np.eye(4) if path.project(ahead) >= shift else np.diag([1.0, -1.0, -1.0, 1.0])
+    twist = np.zeros(6)
+    twist[motion.parametrisation.joints[0]] = shift
+    twist[2] += motion.pitch * twist[5]
+    left = motion.left @ transform(exp_so3(twist[3:]), twist[:3])
+    motion = replace(motion, left=left @ turn, right=turn @ motion.right)
+    return replace(fit, motion=motion, joint_values=turn[2, 2] * values, frame=motion.left)
 
 
 def place_frame(model: Model, frame: str, pose: Array) -> None:
