@@ -555,9 +555,3 @@ class Tour(Agenda):
         """Go on as a closer."""
         self.name = Closer.name
         return Closer.choose(self, session)
-
-
-BEHAVIOURS: Mapping[str, Callable[..., Behaviour]] = {
-    one.name: one for one in (Closer, Tour, OpenByName, CloseByName)
-}
-"""Behaviours by name."""
