@@ -7,6 +7,7 @@ import os
 import subprocess
 import sys
 import threading
+import time
 import weakref
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -77,6 +78,22 @@ def test_an_undo_within_an_edit_is_refused(server: Server, load: Callable[..., L
     assert server.revision == model.version == 2
     with pytest.raises(kv.errors.EditError, match="no revision"):
         model.undo(10**30)
+
+
+def test_who_is_refused_finds_that_in_the_status(
+    server: Server, load: Callable[..., LiveModel], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model, note = load(), server._note
+
+    def note_late(*given: Any) -> None:
+        time.sleep(0.2)
+        note(*given)
+
+    monkeypatch.setattr(server, "_note", note_late)
+    with pytest.raises(kv.errors.EditError, match="no revision"):
+        model.undo(7)
+    (refusal,) = model.exchange.status().refusals
+    assert refusal.who == model.exchange.who
 
 
 def test_nobody_waits_for_a_connection_that_was_closed(

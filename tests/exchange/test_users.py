@@ -233,7 +233,7 @@ def test_users_edit_by_their_rights(served: Server, load_as: Callable[[str], Liv
     assert len(calls) == 1
     assert served.revision == 3
     refused = [*2 * ["bob"], *3 * ["carol"]]
-    wait_until(lambda: [one.who.partition(",")[0] for one in alice.exchange.status().refusals] == refused)
+    assert [one.who.partition(",")[0] for one in alice.exchange.status().refusals] == refused
 
 
 def test_a_client_of_a_user_is_there_as_long_as_it_lives(

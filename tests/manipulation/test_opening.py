@@ -359,10 +359,14 @@ def test_retreats_go_aside_where_the_arm_does_not_reach_straight_back(at_the_doo
 
 
 def test_locked_drawer_is_told_at_once():
-    world = KinematicWorld(pusher(locked=True), "robot")
+    model = pusher(locked=True)
+    with model.edit() as edit:
+        edit.constrain("room/bolt/range", 0, kv.position("room/bolt"), 0.4)  # .5 would unlock it
+    world = KinematicWorld(model, "robot")
     world.reset(world.model.default_state().updated({"robot/finger": 0.05, "robot/z": 2.0}))
     outcome = open_object(connect(world), "room/drawer")
     assert not outcome
+    assert "room/drawer = 0.4: cannot be reached" in outcome.reason
     assert "'room/drawer' is locked at 0 while 'room/bolt' is 0" in outcome.reason
     assert (outcome.measures["failure"], outcome.steps) == ("other", 0)
 

@@ -122,25 +122,27 @@ def cut_all(rounds: int) -> dict[str, Any]:
     robot = Robot(KinematicWorld(load_robot(), "bot"), [__file__, "moves"])
     said, skill, times = robot.lines["stdout"], robot.skill, dict[str, list[float]]()
 
+    def signal_node(number: signal.Signals) -> None:
+        os.kill(int([line for line in said if line.startswith("node ")][-1].split()[1]), number)
+
     def note(name: str, cut: Callable[[], object]) -> None:
         robot.await_motion()
         times.setdefault(name, []).append(robot.measure(cut))
 
     try:
-        for k in range(rounds):
-            robot.wait(lambda k=k: len(said) > 2 * k)
-            node = int(said[-1].removeprefix("node "))
+        for _ in range(rounds):
+            robot.wait(lambda: said and said[-1].startswith("node "))
             note("skill stopped", lambda: skill.send_signal(signal.SIGSTOP))
             skill.send_signal(signal.SIGCONT)
             note("robot silent", lambda: setattr(robot, "silent", True))
             robot.silent = False
-            note("node stopped", lambda node=node: os.kill(node, signal.SIGSTOP))
-            os.kill(node, signal.SIGCONT)
-            note("node killed", lambda node=node: os.kill(node, signal.SIGKILL))
+            note("node stopped", lambda: signal_node(signal.SIGSTOP))
+            signal_node(signal.SIGCONT)
+            note("node killed", lambda: signal_node(signal.SIGKILL))
         note("skill killed", skill.kill)
     finally:
         robot.end()
-    return {"times": times, "said": [line.strip() for line in said[1::2]]}
+    return {"times": times, "said": [line.strip() for line in said if not line.startswith("node ")]}
 
 
 def open_object(model: str, name: str, coordinate: str, words: list[str]) -> dict[str, Any]:

@@ -41,7 +41,8 @@ def test_speeds_are_zero_within_a_tenth_of_a_second_after_a_cut(ros_python, roun
     print({name: f"{1000 * max(seconds):.0f} ms of {len(seconds)}" for name, seconds in times.items()})
     # A machine that does other things as well is late at times, also to measure.
     assert max(map(max, times.values())) <= (0.1 if rounds > 1 else 1.0), times
-    assert answer["said"][0] == "The robot node has ended, and the robot was stopped."
+    ended = "The robot node has ended, and the robot was stopped."
+    assert answer["said"].count(ended) == rounds, answer["said"]
 
 
 def test_a_skill_moves_an_object_through_topics_alone(ros_python, tmp_path, monkeypatch):

@@ -176,6 +176,15 @@ def test_a_session_moves_it_and_ends_with_a_reason_if_its_node_does(started):
     assert session.broken
 
 
+def test_an_end_of_the_node_is_said_by_who_finds_it_out_first(started):
+    robot, far = started(Scripted)
+    with robot._lock:  # the thread that hears it waits
+        far.kill()
+        far.wait()
+        with pytest.raises(SimulationError, match="has ended"):
+            robot.apply({}, 0.02)
+
+
 def test_a_skill_that_hears_nothing_from_the_robot_ends_with_a_reason(started):
     robot, far = started(Scripted)
     session = Session(robot, belief=EncoderBelief(robot.model, robot.robot), patience=0.1)

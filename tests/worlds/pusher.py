@@ -7,7 +7,7 @@ import numpy as np
 import kineverse as kv
 from kineverse.articulations.locks import speed_lock
 from kineverse.grasping import Gripper, find_gripper
-from kineverse.model.body import Body, Box, Cylinder, Geometry, Pose, Shape, Sphere
+from kineverse.model.body import Body, Box, Cylinder, Geometry, Inertia, Pose, Shape, Sphere
 
 BALL, PANEL, HINGE = 0.03, 0.02, np.array([1.0, 0.0])
 """Radius of the ball, thickness of the door, and its hinge [m]."""
@@ -17,12 +17,15 @@ def solid(geometry: Geometry, at: tuple[float, float, float] = (0, 0, 0)) -> Bod
     return Body(collisions=(Shape(geometry, Pose.from_matrix(np.array(kv.translation(*at)()))),))
 
 
-def pusher(*, locked: bool = False, closed_at: float = 0.0) -> kv.Model:
+def pusher(
+    *, locked: bool = False, closed_at: float = 0.0, mass: float | None = None, aside: float = 0.0
+) -> kv.Model:
     """A ball 0.5 m above a hand: both move in x, y and turn; the furniture stands at different heights.
 
     The door (z = 0.3 to 0.7) turns about (1, 0) and opens away from the robot; a handle is before it at y = 0.7
     and z = 0.
-    The drawer (z = 2) is shut at x = 1 and its handle is a bar before it.
+    The drawer (z = 2) is shut at x = 1 and its handle is a bar before it. ``aside`` moves the drawer in y [m].
+    A robot with a mass [kg] is strong enough to pull in a world with forces.
     """
     x, y, z, turn, finger = (kv.position(f"robot/{name}") for name in ("x", "y", "z", "turn", "finger"))
     door, drawer, bolt, puck = (kv.position(f"room/{name}") for name in ("door", "drawer", "bolt", "puck"))
@@ -31,7 +34,8 @@ def pusher(*, locked: bool = False, closed_at: float = 0.0) -> kv.Model:
     )
     model = kv.Model()
     with model.edit() as edit:
-        edit.add_frame("robot/base", "world", kv.translation(x, y, z) @ kv.rotation_z(turn))
+        body = Body() if mass is None else Body(inertia=Inertia(mass, (0.4, 0, 0, 0.4, 0, 0.4)))
+        edit.add_frame("robot/base", "world", kv.translation(x, y, z) @ kv.rotation_z(turn), body)
         edit.add_frame("robot/ball", "robot/base", kv.translation(0, 0, 0.5), solid(Sphere(BALL)))
         edit.add_frame("robot/palm", "robot/base", np.eye(4), solid(Box((0.04, 0.12, 0.06))))
         tip = solid(Box((0.06, 0.01, 0.03)))
@@ -45,7 +49,9 @@ def pusher(*, locked: bool = False, closed_at: float = 0.0) -> kv.Model:
         )
         edit.constrain("room/door/range", -1.5, door, 1.5)
         edit.constrain("room/door/speed", -1.0, kv.velocity("room/door"), 1.0)
-        edit.add_frame("room/drawer", "world", kv.translation(1 - drawer, 0, 2), solid(Box((0.02, 0.4, 0.2))))
+        edit.add_frame(
+            "room/drawer", "world", kv.translation(1 - drawer, aside, 2), solid(Box((0.02, 0.4, 0.2)))
+        )
         edit.add_frame(
             "room/drawer_handle", "room/drawer", kv.translation(-0.06, 0, 0), solid(Cylinder(0.01, 0.1))
         )

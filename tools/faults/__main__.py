@@ -9,9 +9,9 @@ import argparse
 import sys
 import time
 
-from . import costs, edge, server, store
+from . import costs, edge, live, server, store
 
-TARGETS = {"store": store, "server": server, "edge": edge, "costs": costs}
+TARGETS = {"store": store, "server": server, "edge": edge, "costs": costs, "live": live}
 """Modules with ``add_arguments`` and ``run``, and a docstring that says what must hold."""
 
 

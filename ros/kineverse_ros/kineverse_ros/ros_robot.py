@@ -49,6 +49,7 @@ _LATER = 0.01  # how much older than the readings a picture is, so that all of i
 _PICTURE = 0.002  # difference of times of poses in a picture [s]
 _NOTES = 8  # number of sentences that are kept
 _STEP = 0.02  # time between two looks at a path [s]
+_LAST = 1.0  # longest time until it is known why a robot node is gone [s]
 _ENDED = "The robot node has ended, and the robot was stopped."
 _LAG = 0.5  # time by which a robot may be late on its path [s]
 _ARRIVAL = 2.0  # time in which it has to be at the end of its path [s]
@@ -401,7 +402,9 @@ class RosRobot:
 
     def _send(self, message: Any) -> None:
         if not self._link.send(message, wait=self.timeout):
-            self._check()
+            with self._lock:  # a node that has just ended is found out here before its last words are read
+                self._lock.wait_for(lambda: bool(self._ended), _LAST)
+                self._check()
             raise SimulationError("The robot node takes no commands.")
 
     def _await_readings(self) -> None:

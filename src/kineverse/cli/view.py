@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import argparse
 import math
+import os
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from kineverse.errors import InvalidValueError
 from kineverse.geometry.exclusions import find_unusable_shapes, label_unusable_shapes
+from kineverse.model.registry import find_scheme
 from kineverse.planning import Trajectory
 from kineverse.view import meshes, save_picture
 from kineverse.view.poses import complete
@@ -40,6 +43,8 @@ from .plan_arguments import add_robot_option, include_robot
 
 if TYPE_CHECKING:
     from kineverse.model.model_view import ModelView
+
+_NICENESS = 10  # of the page of a live system
 
 HELP = """\
 The page is served to this computer only, until Ctrl-C; with --host also to others, who need the address with
@@ -143,7 +148,7 @@ def run(arguments: argparse.Namespace) -> int:
     from kineverse.view.viewer import Viewer  # for start-up time
 
     options = {"label": label, "degrees": arguments.degrees, **page_options(arguments)}
-    with handle_interrupts(), Viewer(model, assigned, **options) as page:
+    with handle_interrupts(), Viewer(model, assigned, **options) as page, ExitStack() as stack:
         if near is not None:
             page.collisions.show_near(near)
         if arguments.decomposed:
@@ -160,6 +165,12 @@ def run(arguments: argparse.Namespace) -> int:
             play_recording(page, recording, time=arguments.time, **speed)
         elif trajectory is not None:
             page.play(trajectory, at=arguments.time, **speed)
+        if find_scheme(arguments.model) is not None and arguments.robot is None:
+            from kineverse.live import LivePage  # for start-up time
+
+            # Whoever controls the robot comes first; threads that are there answer the emergency stop.
+            os.nice(_NICENESS)
+            stack.enter_context(LivePage(page, model))
         print_address(page, browser=not arguments.no_browser)
         print(recording or model, flush=True)
         page.wait()

@@ -299,8 +299,8 @@ class Server(Closing):
                     self._refuse(request, "malformed", error)
                     continue
                 except RefusedError as error:
-                    request.answer(protocol.encode(error.answer))
                     self._note_refusal(error.answer.who, error.answer)
+                    request.answer(protocol.encode(error.answer))
                     continue
                 edits.append(asked)
                 rights.append(right)
@@ -337,8 +337,8 @@ class Server(Closing):
         self._note_time("publish", begin)
         begin = time.perf_counter()
         for request, edit, result in zip(requests, edits, results, strict=True):
+            self._note(edit, result)  # first, for who asks for the status as soon as the answer is there
             request.answer(protocol.encode(result.answer))
-            self._note(edit, result)
         self._note_time("answer", begin)
 
     def _begin_again(self) -> None:

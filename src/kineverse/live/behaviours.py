@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -73,11 +73,13 @@ class Task:
     opening: bool
     why: str
     by_push: bool = False
+    far: float = 1.0  # share of the whole way by which it is opened
 
     @property
     def target(self) -> float:
         """Wanted value of the coordinate [m], [rad]."""
-        return self.object.opened if self.opening else self.object.shut
+        shut, opened = self.object.shut, self.object.opened
+        return shut + self.far * (opened - shut) if self.opening else shut
 
     def __str__(self) -> str:
         verb = "opens" if self.opening else "pushes" if self.by_push else "closes"
@@ -111,6 +113,8 @@ class Behaviour:
         Longest time of a skill [s].
     seed
         Seed of all searches.
+    far
+        Share of the whole way by which things are opened.
 
     Attributes
     ----------
@@ -132,7 +136,9 @@ class Behaviour:
         hand: str | None = None,
         seconds: float = 90.0,
         seed: int = 0,
+        far: float = 1.0,
     ) -> None:
+        self._far = far
         self._sessions, self._report, self._hand = sessions, report, hand
         self._patterns = None if patterns is None else tuple(patterns)
         self._seconds, self.seed = seconds, seed
@@ -275,7 +281,7 @@ class Behaviour:
         handle = self.scene.find_held(session)
         if handle is None:
             return True
-        self._say("lets go", f"The hand is at '{handle.frame}', and nobody knows why.")
+        self._say("lets go", f"The hand is at '{handle.frame}', as after a skill that was broken off.")
         run = SkillRun(session, handle.coordinate, _LETTING_GO)
         motion = self.scene.motion(run, handle, self.seed)
 
@@ -458,9 +464,11 @@ class Closer(Behaviour):
 class Agenda(Closer):
     """Behaviour that does some tasks one after the other, and tries each a few times."""
 
-    def __init__(self, sessions: SessionSource, skills: Iterable[bool], **options: object) -> None:
-        super().__init__(sessions, **options)  # type: ignore[arg-type]
-        self._skills = tuple(skills)
+    def __init__(
+        self, sessions: SessionSource, skills: Iterable[bool], *, rounds: int = 1, **options: Any
+    ) -> None:
+        super().__init__(sessions, **options)
+        self._skills = tuple(skills) * rounds
         self._left: list[tuple[str, bool]] | None = None
         self._tries, self._unseen_since = 0, -np.inf
 
@@ -473,15 +481,16 @@ class Agenda(Closer):
         name, opening = self._left[0]
         one = self.scene.names.get(name)
         if one is None:
-            return self._give_up(None, "The model has it no longer.")
-        task = Task(
-            one, opening, "It was asked for." if not self._tries else f"This is try {self._tries + 1}."
-        )
+            self._give_up(None, "The model has it no longer.")
+            return None
+        why = "It was asked for." if not self._tries else f"This is try {self._tries + 1}."
+        task = Task(one, opening, why, far=self._far)
         if why := self.scene.find_unseen(session, one):
             if self._unseen_since < 0.0:
                 self._unseen_since = session.time
             if session.time - self._unseen_since > _UNSEEN:
-                return self._give_up(task, f"'{name}' {why}.")
+                self._give_up(task, f"'{name}' {why}.")
+                return None
             self._wait("waits", f"'{name}' {why}.")
             return None
         self._unseen_since = -np.inf
@@ -530,7 +539,7 @@ class OpenByName(Agenda):
 
     name = "open"
 
-    def __init__(self, sessions: SessionSource, **options: object) -> None:
+    def __init__(self, sessions: SessionSource, **options: Any) -> None:
         super().__init__(sessions, (True,), **options)
 
 
@@ -539,7 +548,7 @@ class CloseByName(Agenda):
 
     name = "close"
 
-    def __init__(self, sessions: SessionSource, **options: object) -> None:
+    def __init__(self, sessions: SessionSource, **options: Any) -> None:
         super().__init__(sessions, (False,), **options)
 
 
@@ -548,7 +557,7 @@ class Tour(Agenda):
 
     name = "tour"
 
-    def __init__(self, sessions: SessionSource, **options: object) -> None:
+    def __init__(self, sessions: SessionSource, **options: Any) -> None:
         super().__init__(sessions, (True, False), **options)
 
     def go_on(self, session: Session) -> Task | None:

@@ -39,6 +39,7 @@ class RobotNote(msgspec.Struct, array_like=True):
     touching: list[str]  # frames whose touch sensors report
     stopped: str = ""  # why the robot takes no commands at all; empty if it does
     force: float = math.nan  # largest force between the robot and another body [N]
+    commanded: float = 0.0  # largest of the speeds that act, without fingers [m/s], [rad/s]
     refused: int = 0  # commands that were too old, in all
     late: int = 0  # ticks that began late by more than half of one, in all
     dropped: int = 0  # ticks that were left out, in all

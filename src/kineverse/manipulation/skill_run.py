@@ -237,6 +237,12 @@ def explain_fixed(model: ModelView, coordinate: Symbol, state: State) -> str:
     return ""
 
 
+def _find_range(model: ModelView, coordinate: Symbol, state: State) -> tuple[float, float]:
+    """Return the limits of a coordinate in a state; where a lock holds it there, those that it can have."""
+    lower, upper = model.limits(coordinate, state)
+    return model.limits(coordinate) if upper - lower <= _FIXED else (lower, upper)
+
+
 def choose_tolerance(
     model: ModelView, coordinate: Symbol, state: State, target: float, given: float | None = None
 ) -> float:
@@ -245,7 +251,7 @@ def choose_tolerance(
     By default that is 2 % of the distance, between 1 and 20 mm (mrad). At a limit, where an object is open or
     shut, it is 20 mm. It is never more than a tenth of the coordinate's range.
     """
-    lower, upper = (float(v) for v in model.limits(coordinate, state))
+    lower, upper = _find_range(model, coordinate, state)
     if given is not None:
         tolerance = given
     elif min(abs(target - lower), abs(target - upper)) <= _FIXED:
@@ -258,12 +264,13 @@ def choose_tolerance(
 
 def choose_target(model: ModelView, coordinate: Symbol, state: State, target: float | None) -> float:
     """Return a wanted value within limits, by default the limit that is the farthest away."""
-    lower, upper = (float(v) for v in model.limits(coordinate, state))
+    lower, upper = _find_range(model, coordinate, state)
     here = state[coordinate]
     if target is None:
         target = upper if abs(upper - here) >= abs(lower - here) else lower
         if not math.isfinite(target):
             raise InvalidValueError(f"'{coordinate}' has no limit to move to; name a target.")
+    lower, upper = model.limits(coordinate)  # a lock may be opened
     if not lower - 1e-9 <= target <= upper + 1e-9:
         raise InvalidValueError(f"'{coordinate}' moves from {lower:g} to {upper:g}, not to {target!r}.")
     return float(target)

@@ -14,6 +14,7 @@ from kineverse.worlds import RunMetrics, SimulatedWorld
 from .articulated_objects import ArticulatedObject
 from .opening.approach_planner import Opener
 from .opening.base_placement import BasePlacement
+from .opening.contact_phases import PhasePlanner
 from .opening.grasped_opening import open_object
 from .outcome import Outcome
 from .session import Belief, Session
@@ -124,10 +125,11 @@ def stand_at_handle(
         base = zip(placement.coordinates, placement.approach.tolist(), strict=True)
         return state.updated({s: v for s, v in base if s in search.standing})
 
+    phase = PhasePlanner(session.model, session.robot, handle).find_next(state, target)
     found = search.find(
         state,
         opener.grasps(handle, state, seed),
-        target,
+        phase.way if phase.handle is handle else target,
         accept=lambda placement: bool(approaches.plan_to(place(placement), placement, seed)),
         samples=placements,
         seed=seed,

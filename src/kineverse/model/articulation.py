@@ -58,6 +58,13 @@ class Articulation:
         """The joint position: the only coordinate, or ``follows``; None if the position is not one number."""
         return self.coordinates[0] if len(self.coordinates) == 1 else self.follows
 
+    def dynamics_of(self, coordinate: Symbol) -> dict[str, Any]:
+        """Return the dynamic parameters of one coordinate: all of a single one, else those below its name."""
+        if len(self.coordinates) == 1:
+            return dict(self.dynamics)
+        start = f"{coordinate.path.rpartition('/')[2]}/"
+        return {key.removeprefix(start): value for key, value in self.dynamics if key.startswith(start)}
+
 
 def check_home(name: str, record: Articulation) -> None:
     """Check the home of an articulation."""

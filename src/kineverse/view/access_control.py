@@ -24,7 +24,8 @@ _AUTHORITY = re.compile(r"(\[[0-9a-f:.]+\]|[a-z0-9._-]+)(?::([0-9]{1,5}))?")
 _POLICY = (
     "default-src 'none'; script-src 'unsafe-inline' 'unsafe-eval' blob:; script-src-attr 'none'; "
     "style-src 'unsafe-inline'; img-src data: blob:; font-src data:; worker-src blob:; "
-    "connect-src data: ws://{host}; object-src 'none'; frame-src 'none'; base-uri 'none'; form-action 'none'"
+    "connect-src data: ws://{host} http://{host}; object-src 'none'; frame-src 'none'; "
+    "base-uri 'none'; form-action 'none'"
 )
 
 

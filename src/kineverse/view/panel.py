@@ -60,6 +60,7 @@ class Panel:
         on_play: Callable[[bool], None],
         on_convert: Callable[[], None],
         degrees: bool = False,
+        sliders: bool = True,
     ) -> None:
         self._gui, self._ranges, self._units, self._on_move = gui, ranges, dict(units), on_move
         self._on_convert = on_convert
@@ -76,13 +77,16 @@ class Panel:
         self._root = gui.add_folder(None)
         with self._root:
             HtmlBox(gui, element("style", Html(STYLE)))
-            self._status = HtmlBox(gui, format_violations(()))
+            self._status = HtmlBox(gui, format_violations(()) if sliders else Html(""))
             proximity.add_folder(gui)
+            self._has_sliders = sliders
             tabs = gui.add_tab_group()
-            with tabs.add_tab("Move"):
+            # Without sliders the tab is empty, and hidden.
+            with tabs.add_tab("Move") if sliders else gui.add_folder(None, visible=False):
                 self._add_controls(on_reset, on_play)
-                self._add_sliders({**values, **quaternions.angles})
-                if drive.speeds:
+                if sliders:
+                    self._add_sliders({**values, **quaternions.angles})
+                if sliders and drive.speeds:
                     self._add_speeds(on_drive)
                 self._lock(values)
             with tabs.add_tab("Show"):
@@ -99,6 +103,8 @@ class Panel:
 
     def update(self, values: Mapping[str, float], set_by_program: Iterable[str] = ()) -> None:
         """Set the ranges of all sliders for a state, and the values of some of them."""
+        if not self._has_sliders:
+            return
         with self._changing:
             self._update({**values, **self._quaternions.angles}, values, set_by_program)
 
@@ -232,6 +238,8 @@ class Panel:
 
     def _lock(self, values: Mapping[str, float]) -> None:
         """Mark the coordinates that are locked at these values, and disable their sliders."""
+        if not self._has_sliders:
+            return
         for name, directions in self._ranges.locked_directions(values).items():
             locked, slider = all(directions), self._sliders[name]
             self._locked[name] = locked

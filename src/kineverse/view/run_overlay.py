@@ -6,7 +6,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -16,8 +16,8 @@ from kineverse.lie import rotation_angle
 from kineverse.model.frame import WORLD
 from kineverse.model.model_view import ModelView
 from kineverse.planning.trajectories.trajectory import Trajectory
-from kineverse.state import State, StateLike
-from kineverse.worlds import Contact, RunRecording, SimulatedWorld
+from kineverse.state import StateLike
+from kineverse.worlds import Contact, RunRecording
 from kineverse.worlds.robot_interface import SkillStep
 
 from .drawables import TRACE, Drawable, Rgba, build_spheres, collect_drawables
@@ -262,6 +262,13 @@ class RunLayer:
                 )
             )
 
+    def exchange(self, drawing: RunDrawing) -> None:
+        """Draw an edited model from the next moment on."""
+        with self._lock:
+            self._drawing = drawing
+            self._server.scene.remove_by_name(_ROOT)
+            self._ghosts, self._arrows, self._way, self._wanted = {}, [], None, None
+
     def remove(self) -> None:
         """Remove everything from the page."""
         with self._lock:
@@ -339,25 +346,37 @@ _MOST_ACTIVE = 4
 _AHEAD = 0.02  # time by which commands are followed to find the velocity of the hand [s]
 
 
-class LiveRun:
-    """Callable for the steps of a session, which shows them on a page.
+class TrueWorld(Protocol):
+    """World of which the truth is known, as :class:`.SimulatedWorld` is."""
 
-    It shows the true state of a simulated world, with the belief as a ghost; without a world, the belief. It
-    draws at most thirty times a second, and waits for the clock so that a world that is faster than real time
-    can be watched. If the steps have a ``reference`` and a ``command``, as those of a
+    @property
+    def state(self) -> StateLike:
+        """The true state."""
+
+    def contacts(self) -> Sequence[Contact]:
+        """Return the contacts of its bodies."""
+
+
+class LiveRun:
+    """Callable for the steps of a session, or of the streams of a live system, which shows them on a page.
+
+    It shows the true state of a world, with the belief as a ghost; without a world, the belief. It draws at
+    most thirty times a second, and waits for the clock so that a world that is faster than real time can be
+    watched. If the steps have a ``reference`` and a ``command``, as those of a
     :class:`kineverse.manipulation.session.Session`, the way of the hand and the active constraints are shown.
     """
 
     def __init__(
         self,
         page: Viewer,
-        world: SimulatedWorld | None = None,
+        world: TrueWorld | None = None,
         *,
         speed: float = 1.0,
         hand: str | None = None,
+        drawing: RunDrawing | None = None,
     ) -> None:
         self._page, self._world, self._speed = page, world, speed
-        self._drawing = RunDrawing(page.model)
+        self._drawing = RunDrawing(page.model) if drawing is None else drawing
         self._layer = RunLayer(page.server, self._drawing, "run")
         self._poses = None if hand is None else FramePoses(page.model, [hand])
         self._drawn = self._begin = 0.0
@@ -376,6 +395,11 @@ class LiveRun:
         if now - self._drawn >= PERIOD:
             self._drawn = now
             self._draw(step)
+
+    def exchange(self, drawing: RunDrawing) -> None:
+        """Draw an edited model from the next step on."""
+        self._drawing = drawing
+        self._layer.exchange(drawing)
 
     def show_text(self, *lines: str) -> None:
         """Show lines of text below the captions, and no drawings, until the next step."""
@@ -402,7 +426,7 @@ class LiveRun:
         self._page.move(self._drawing.values(shown))
         self._layer.draw(RunMoment(ghosts, find_arrows(vectors), lines, way, wanted))
 
-    def _shown(self, step: SkillStep) -> State:
+    def _shown(self, step: SkillStep) -> StateLike:
         return step.state if self._world is None else self._world.state
 
     def _find_hand_velocity(self, step: SkillStep) -> Vectors:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import dataclasses
 import errno
@@ -27,7 +28,8 @@ TAKEN_DOWN = (
     "kv.show(model) waits by itself."
 )
 
-_TITLE = b"<title>Viser</title>"
+_TITLE, _END = b"<title>Viser</title>", b"</body>"
+_OWN = "X-Kineverse"  # header of requests by scripts of the page
 
 
 def start(port: int | None = None, label: str = "", host: str = HOST) -> Any:
@@ -59,6 +61,20 @@ def start(port: int | None = None, label: str = "", host: str = HOST) -> Any:
         @property
         def address(self) -> str:
             return access.address(self.get_port())
+
+        def add_html(self, content: str) -> None:
+            """Add HTML to the page, for browsers that load it from now on."""
+            gate.html += content
+
+        def add_answer(self, path: str, function: Callable[[str], str]) -> None:
+            """Answer requests of the page's own scripts for a path by a function of their header: JSON."""
+            gate.answers[path] = function
+
+        @property
+        def is_behind(self) -> bool:
+            """True while a browser has not taken what was drawn last."""
+            buffer = self._websock_server._broadcast_buffer
+            return any(buffer.message_counter - 1 > last for last in buffer.generator_cursors.values())
 
     with suppress_console():
         server = LocalServer(host=host, port=_free_port(host, port), label=label, verbose=False)
@@ -113,6 +129,7 @@ class _GuardedWebsockets(_PatchedModule):
         server = _PatchedModule(websockets.asyncio.server, serve=self._serve)
         super().__init__(websockets, asyncio=_PatchedModule(websockets.asyncio, server=server))
         self.installed = False
+        self.html, self.answers = "", dict[str, Callable[[str], str]]()
         self._access, self._title = access, title
 
     def _serve(self, *arguments: Any, process_request: Any, **options: Any) -> Any:
@@ -123,12 +140,12 @@ class _GuardedWebsockets(_PatchedModule):
         return websockets.asyncio.server.serve(*arguments, process_request=checked, **options)
 
     def _checked(self, process_request: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
-        """Return a handler that refuses requests, or passes them on without the token."""
+        """Return a handler that refuses requests, answers them, or passes them on without the token."""
         from websockets.http11 import Response
 
         access = self._access
 
-        def process(connection: Any, request: Any) -> Any:
+        async def process(connection: Any, request: Any) -> Any:
             headers = request.headers.copy()
             hosts, origins = headers.get_all("Host"), headers.get_all("Origin")
             upgrades = bool(headers.get_all("Upgrade"))
@@ -140,11 +157,21 @@ class _GuardedWebsockets(_PatchedModule):
                 return Response(403, "Forbidden", type(headers)(about), text)
             # The page is changed below, which requires that it is not compressed.
             headers.pop("Accept-Encoding", None)
-            inner = dataclasses.replace(request, path=access.inner_path(request.path), headers=headers)
+            path = access.inner_path(request.path)
+            answer = self.answers.get(path or "")
+            # Browsers send this header from scripts of the page alone: other pages would have to ask before.
+            if answer is not None and _OWN in headers:
+                text = (await asyncio.to_thread(answer, headers[_OWN])).encode()
+                about = {"Content-Type": "application/json", "Content-Length": str(len(text))}
+                about |= {"Cache-Control": "no-store"}
+                return Response(200, "OK", type(headers)(about), text)
+            inner = dataclasses.replace(request, path=path, headers=headers)
             response = process_request(connection, inner)
             if response is not None:
                 title = f"<title>{html.escape(self._title)}</title>" if self._title else _TITLE.decode()
-                response.body = (response.body or b"").replace(_TITLE, title.encode(), 1)
+                body = (response.body or b"").replace(_TITLE, title.encode(), 1)
+                before, end, after = body.rpartition(_END)
+                response.body = before + self.html.encode() + end + after
                 response.headers.pop("Content-Length", None)
                 response.headers.update(
                     access.headers(hosts[0]), **{"Content-Length": str(len(response.body))}

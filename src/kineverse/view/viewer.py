@@ -20,7 +20,7 @@ from . import server as web
 from .animation import PlaybackLayer, RangeAnimation, TrajectoryPlayback, VelocityDrive, select_animated
 from .camera import Camera
 from .drawables import Drawable
-from .html import element, format_failure, format_violations
+from .html import Html, element, format_failure, format_violations
 from .page import choose_title
 from .panel import Panel
 from .poses import complete, keep_known
@@ -66,6 +66,7 @@ class Viewer:
         self._asked, self._done = 1, 0
         self._stopping, self._edited = False, False
         self._driven: set[str] = set()
+        self._is_driven = False
         self._ended = threading.Event()
         self._animation: RangeAnimation | TrajectoryPlayback | None = None
         self._playback: TrajectoryPlayback | None = None
@@ -117,6 +118,11 @@ class Viewer:
     def pose(self, frame: str) -> Floats:
         """Return the pose of a frame in the world that was drawn last, 4×4."""
         return self._scene.pose(frame)
+
+    def hide_sliders(self) -> None:
+        """Show neither sliders nor the report of constraints: something else moves the model."""
+        self._is_driven = True
+        self.refresh()
 
     def show_overlay(self, items: Iterable[Drawable]) -> None:
         """Show further parts over the model, such as spheres; they move with their frames."""
@@ -293,6 +299,7 @@ class Viewer:
             on_play=self.play,
             on_convert=self._request_redraw,
             degrees=degrees,
+            sliders=not self._is_driven,
         )
 
     def _set_from_slider(self, name: str, value: float) -> None:
@@ -394,6 +401,9 @@ class Viewer:
             self.collisions.worker.update(values, edited)
             if self.unplaced:
                 self._panel.show(format_failure(f"Not finite, and hidden: {', '.join(self.unplaced)}."))
+                return
+            if self._is_driven:
+                self._panel.show(Html(""))
                 return
             # An empty mapping would lack values; an empty state is that of a model without symbols.
             violated = self._shown.violations(State(values))

@@ -20,7 +20,9 @@ if TYPE_CHECKING:
     from .sensor_sampler import SensorSampler as SensorSampler
     from .sensors import Sensors as Sensors
     from .simulated_world import (
+        ChangeableWorld as ChangeableWorld,
         Contact as Contact,
+        ForceLimit as ForceLimit,
         SimulatedWorld as SimulatedWorld,
         TrueBelief as TrueBelief,
     )

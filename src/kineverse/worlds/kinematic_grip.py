@@ -186,7 +186,29 @@ class KinematicGrip:
         nearest = min(touched[0][best], touched[1][best])
         if nearest[0] > TOUCH:
             return
-        body = motion.scene.bodies[nearest[1]]
+        self._take(motion.scene.bodies[nearest[1]])
+
+    def hold(self, body: str) -> bool:
+        """Hold a body where it is in the hand, if a finger is near it; return whether it is held."""
+        motion = self._motion
+        bodies = motion.scene.bodies
+        group = motion.group[bodies.index(body)] if body in bodies else -1
+        pairs, index = motion.find_near(max(self._near, TOUCH))
+        fingers = np.concatenate(self._fingers)
+        for pair in pairs.body_indices[index] if len(index) else ():
+            if np.isin(pair, fingers).any() and (motion.group[pair] == group).any():
+                self._take(body)
+                return True
+        self._report(f"'{body}' is not held any more")
+        return False
+
+    def place_of(self, body: str) -> Array:
+        """Return the pose hand_T_body (4, 4) of a body."""
+        place: Array = inverse(self._hand()) @ self._motion.scene.pose(body)
+        return place
+
+    def _take(self, body: str) -> None:
+        motion = self._motion
         hand, world_T_body = self._hand(), motion.scene.pose(body)
         middle = inverse(world_T_body) @ hand @ self.gripper.grasp_pose[:, 3]
         if body not in self._errors:
@@ -194,7 +216,8 @@ class KinematicGrip:
             self._errors[body] = _HoldError(model, self.gripper.hand, body, speeds)
         self._error = self._errors[body].bind(inverse(hand) @ world_T_body, middle[:3], motion.q)
         self.held = body
-        same = [b for k, b in enumerate(motion.scene.bodies) if motion.group[k] == best]
+        group = motion.group[motion.scene.bodies.index(body)]
+        same = [b for k, b in enumerate(motion.scene.bodies) if motion.group[k] == group]
         motion.ignore(self.gripper.bodies, same)
         self._report(f"'{body}' is held")
 

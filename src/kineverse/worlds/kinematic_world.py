@@ -1,11 +1,11 @@
 """Quasi-static world: touched bodies are displaced along the contact normal, a held body follows the hand.
 
-It takes speeds of the robot alone. An object stands still unless a body of the robot would penetrate it; then
-it moves by the least that its limits, speed limits and locks allow, see :mod:`.quasistatic`. So objects can
-be pushed and not dragged, have no inertia, and nothing falls. What cannot give way is penetrated, and
-:meth:`KinematicWorld.contacts` reports it; so is furniture that never moves. What the robot moves stops at
-other furniture, beyond the overlaps of the start, see :mod:`.furniture_overlaps`. The robot goes exactly
-where its speeds lead, also beyond its limits.
+It takes speeds of the robot alone. An object stands still unless a body of the robot would penetrate it, or
+its spring moves it; then it moves by the least that its limits, speed limits and locks allow, see
+:mod:`.quasistatic`. So objects can be pushed and not dragged, have no inertia, and nothing falls. What cannot
+give way is penetrated, and :meth:`KinematicWorld.contacts` reports it; so is furniture that never moves. What
+the robot moves stops at other furniture, beyond the overlaps of the start, see :mod:`.furniture_overlaps`.
+The robot goes exactly where its speeds lead, also beyond its limits.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Iterable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -34,7 +34,15 @@ from .robot import Robot
 from .robot_interface import Observation
 from .sensor_sampler import SensorSampler
 from .sensors import Sensors
-from .simulated_world import Contact
+from .simulated_world import (
+    SAME_PLACE,
+    Contact,
+    carried_sensors,
+    carried_state,
+    displaced_state,
+    refuse_overlap,
+    saved_time,
+)
 from .speed_commands import ROUNDING, SpeedCommands, check_settings
 
 logger = logging.getLogger(__name__)
@@ -115,6 +123,11 @@ class KinematicWorld:
         self.robot = robot = Robot.of(model, robot)
         self.model, self._version, self.timeout = model, model.version, float(timeout)
         left_out = as_entries("leave_out=", leave_out, str, "names of constraints")
+        self._settings: dict[str, Any] = {
+            "gripper": gripper, "grasp_tolerance": grasp_tolerance, "slip": slip, "timeout": timeout,
+            "delay": delay, "seed": seed,
+        }  # fmt: skip
+        self._left_out = left_out
         for name in left_out:
             if name not in model.constraints:
                 raise UnknownNameError(
@@ -142,6 +155,10 @@ class KinematicWorld:
             left_out,
         )
         remarks += [f"'{name}' is not enforced: {why}" for name, why in self._motion.skipped]
+        remarks += [
+            f"the spring of '{name}' does nothing, as it carries a weight, and nothing has one here"
+            for name in self._motion.springs.skipped
+        ]
         self._grip = (
             None
             if gripper is None
@@ -237,6 +254,55 @@ class KinematicWorld:
         self._state = self._contacts = None
         self._sampler.reset()
 
+    @property
+    def sensors(self) -> Sensors:
+        """Settings of the sensors; others take effect with the next readings."""
+        return self._sampler.sensors
+
+    @sensors.setter
+    def sensors(self, sensors: Sensors) -> None:
+        self._sampler.change(sensors)
+
+    def displace(self, values: StateLike) -> None:
+        """Move furniture as a person does, see :meth:`.ChangeableWorld.displace`."""
+        self._check_version()
+        state = displaced_state(self, values)
+        if (bodies := self._motion.displace(state.vector(self._motion.symbols))) is not None:
+            raise refuse_overlap(*bodies, values)
+        self._state = self._contacts = None
+
+    def resume(self, state: StateLike, held: str | None = None) -> None:
+        """Go on from a state that was saved, see :meth:`.ChangeableWorld.resume`."""
+        self.reset(state)
+        self._time = saved_time(state)
+        if held is not None and self._grip is not None:
+            self._grip.hold(held)
+
+    def take_over(self, other: KinematicWorld) -> None:
+        """Go on where another world is, see :meth:`.ChangeableWorld.take_over`."""
+        held = other.held
+        self.resume(carried_state(other, self.model))
+        self._events = [*other._events]
+        self._commands.take_over(other._commands)
+        self._sampler.take_over(other._sampler, carried_sensors(other.sensors, self.model))
+        if held is not None and self._grip is not None and other._grip is not None:
+            known = held in self._motion.scene.bodies
+            before, after = (
+                grip.place_of(held) if known else np.eye(4) for grip in (other._grip, self._grip)
+            )
+            if known and np.allclose(before, after, rtol=0.0, atol=SAME_PLACE):
+                self._grip.hold(held)
+            else:
+                self._report(f"'{held}' is released: it was moved, or is gone")
+
+    def rebuild(self, model: ModelView) -> KinematicWorld:
+        """Return a world of another model that goes on where this one is; its scene is ``Scene(model)``."""
+        kept = [name for name in self._left_out if name in model.constraints]
+        sensors = carried_sensors(self.sensors, model)
+        result = KinematicWorld(model, self.robot, sensors=sensors, leave_out=kept, **self._settings)
+        result.take_over(self)
+        return result
+
     def apply(self, speeds: StateLike, duration: float, *, stamp: float | None = None) -> None:
         """Advance by a duration with speeds of the robot, as :meth:`.RobotInterface.apply`.
 
@@ -264,11 +330,12 @@ class KinematicWorld:
         moved = motion.travel() - before
         # The travel restarts at some time.
         moved[moved < 0.0] = _UNKNOWN_TRAVEL
-        travel = float(moved.max(initial=0.0)) + reach
+        sprung = motion.spring_travel(time)
+        travel = float(moved.max(initial=0.0)) + reach + sprung
         grips = grip is not None and (grip.held is not None or reach > 0.0)
         # What is not near now has not been touched on the way.
         longest = motion.longest_motion(moved, travel)
-        count = 0 if longest is None else math.ceil((longest + reach) / _SUBSTEP)
+        count = 0 if longest is None else math.ceil((longest + reach + sprung) / _SUBSTEP)
         if grip is not None and grip.held is not None:
             count = max(count, math.ceil(travel / _HELD_SUBSTEP))
         count = min(count, _MOST_SUBSTEPS)
@@ -277,7 +344,7 @@ class KinematicWorld:
             for _ in range(count):
                 motion.place(self._integrate(motion.q, arm, time / count))
                 self._settle(time / count, travel / count, grips)
-        elif longest is not None or grips:
+        elif longest is not None or grips or sprung:
             self._settle(time, travel, grips)
 
     def _settle(self, time: float, moved: float, grips: bool) -> None:

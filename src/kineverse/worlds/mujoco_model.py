@@ -26,7 +26,8 @@ from .robot import Robot
 CURVE_TOLERANCE = 0.01  # largest error of a joint on a curve, which MuJoCo has as a polynomial [m], [rad]
 _DRAWER = 3.0, 5.0
 _DOOR = 1.0, 1.0
-_KNOB = 0.02, 0.02  # friction [N], [N m] and damping [N s/m], [N m s] of furniture that states neither
+_KNOB = 0.02, 0.02
+_BUTTON = 0.2, 2.0  # friction [N], [N m] and damping [N s/m], [N m s] of furniture that states neither
 _KNOB_MASS = 1.0
 _DENSITY, _MESH_MASS = 500.0, 0.5  # assumed for bodies without inertia [kg/m³], and for a mesh [kg]
 _CONDIM = 6
@@ -36,18 +37,23 @@ _SWEEP = 65  # number of places between its limits at which a joint is checked
 _FOLDER = Path("/")
 
 
-def export_spec(model: ModelView, leave_out: Iterable[str], remark: Callable[[str], None]) -> Any:
+def export_spec(
+    model: ModelView, leave_out: Collection[str], locks: Collection[str], remark: Callable[[str], None]
+) -> Any:
     """Return a model as an ``MjSpec``, without its visual shapes.
 
-    A motion along a curve is approximated within :data:`CURVE_TOLERANCE`.
+    A motion along a curve is approximated within :data:`CURVE_TOLERANCE`. Constraints among ``locks`` are
+    left out without a remark, as the world has them.
     """
-    engine, path, names = mujoco(), _FOLDER / "world.xml", tuple(leave_out)
+    engine, path, names = mujoco(), _FOLDER / "world.xml", (*leave_out, *locks)
+    silent = tuple(f"'{name}' is left out" for name in locks)
     try:
         written = to_mjcf(model, path, names, visuals=False)
     except UnsupportedError:
         written = to_mjcf(model, path, names, CURVE_TOLERANCE, visuals=False)
     for text in written.remarks:
-        remark(text)
+        if not text.startswith(silent):
+            remark(text)
     for frame, error in written.errors.items():
         remark(f"'{frame}' moves by a polynomial in place of a curve, off by {error} at most")
     with capture_mujoco_warnings():
@@ -130,7 +136,10 @@ def add_joint_friction(
             body = compiled.jnt_bodyid[compiled.joint(name).id]
             slides = joint.type == engine.mjtJoint.mjJNT_SLIDE
             light = compiled.body_subtreemass[body] < _KNOB_MASS
-            given = _DRAWER if slides else _KNOB if light else _DOOR
+            if slides:
+                given = _BUTTON if light and np.any(joint.stiffness) else _DRAWER
+            else:
+                given = _KNOB if light else _DOOR
             joint.frictionloss = given[0]
             joint.damping = _like(joint.damping, given[1])
             units = ("N", "N s/m") if slides else ("N m", "N m s")
@@ -214,6 +223,7 @@ def weigh_contacts(compiled: Any, bodies: Iterable[int]) -> None:
 
     MuJoCo regularises a contact by the motion that a force at the centre of mass causes. Of a door whose
     description puts that on the hinge, as many do that state none, this is zero, and the solver fails.
+    Contacts of light parts with a spring are stiff: a finger would sink into a button by millimetres.
     """
     engine, data = mujoco(), mujoco().MjData(compiled)
     engine.mj_forward(compiled, data)
@@ -224,6 +234,11 @@ def weigh_contacts(compiled: Any, bodies: Iterable[int]) -> None:
             engine.mj_solveM(compiled, data, solved, jacobian)
             weight = float((jacobian * solved).sum()) / 3.0
             compiled.body_invweight0[body, 0] = max(compiled.body_invweight0[body, 0], weight)
+            joints = compiled.body_jntadr[body] + np.arange(compiled.body_jntnum[body])
+            if compiled.body_subtreemass[body] < _KNOB_MASS and np.any(compiled.jnt_stiffness[joints]):
+                compiled.geom_priority[geom] = 1
+                compiled.geom_solref[geom] = 2.0 * float(compiled.opt.timestep), 1.0
+                compiled.geom_solimp[geom, :3] = _STIFF_SOLIMP
 
 
 def exclude_overlaps(

@@ -175,6 +175,12 @@ class JointServos:
         self._rates = np.zeros(len(self._at))
         data.ctrl[self._actuators] = self._target
 
+    def take_over(self, other: JointServos, data: Any) -> None:
+        """Go on with the speeds of the servos of another world."""
+        rates = dict(zip(other.coordinates, other._rates.tolist(), strict=True))
+        self.reset(data)
+        self._rates[:] = [rates.get(s, 0.0) for s in self.coordinates]
+
     def drive(self, data: Any, rates: Array) -> None:
         """Move the set points by one time step at speeds (n,), and set the controls."""
         q, most = data.qpos[self._at], self._step * self._acceleration
@@ -372,8 +378,7 @@ class GripperDrive:
                 self._target = data.qpos[self._at].copy()
                 self._release(data)
         elif not self.is_gripping and (closing > _STILL).any() and self.pressed(data) is not None:
-            self.is_gripping = True
-            self._bind(data)
+            self.hold(data)
         if self.is_gripping:
             data.ctrl[self._actuators] = self._closing * self._limit
             return
@@ -381,6 +386,12 @@ class GripperDrive:
         self._target += self._step * rates
         np.clip(self._target, q - self._lead, q + self._lead, out=self._target)
         data.ctrl[self._actuators] = self._damping * (rates + _FOLLOWING * (self._target - q))
+
+    def hold(self, data: Any, body: str | None = None) -> None:
+        """Press what is between the fingers; where grasps are ties, bind it, or the body that is named."""
+        self.is_gripping = True
+        data.ctrl[self._actuators] = self._closing * self._limit
+        self._bind(data, body or self.pressed(data))
 
     def pressed(self, data: Any) -> str | None:
         """Return the body that both fingers press, the one with most force; None if there is none."""
@@ -406,9 +417,8 @@ class GripperDrive:
             rows.append(along @ jacobian)
         return np.array(rows)
 
-    def _bind(self, data: Any) -> None:
-        """Weld the held body to the hand, where grasps are ties."""
-        name = self.pressed(data)
+    def _bind(self, data: Any, name: str | None) -> None:
+        """Weld a body to the hand, where grasps are ties."""
         if self._tie < 0 or name is None:
             return
         engine, hand = mujoco(), self._compiled.body(self._gripper.hand).id

@@ -1,22 +1,25 @@
-"""State of a model in MuJoCo: its coordinates in the vector of positions, and contacts with their forces."""
+"""State of a model in MuJoCo: coordinates in the vector of positions, limits that depend on it, contacts."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from kineverse.compilation import compile
 from kineverse.errors import InvalidValueError
+from kineverse.expressions.expression import array
 from kineverse.formats.mjcf.mujoco_api import mujoco
 from kineverse.formats.poses import pose_from_quaternion
 from kineverse.lie import Array, to_quaternion
+from kineverse.model.constraint import Constraint
 from kineverse.model.model_view import ModelView
 from kineverse.state import State, StateLike, as_state
 from kineverse.symbols import Symbol
 
+from .robot import Robot
 from .simulated_world import Contact
 
 _QUATERNION = ("qw", "qx", "qy", "qz")
@@ -136,6 +139,97 @@ def _pose(position: Array, wxyz: Array) -> Array:
     w, x, y, z = np.asarray(wxyz, dtype=float).tolist()
     a, b, c = np.asarray(position, dtype=float).tolist()
     return pose_from_quaternion((a, b, c), (x, y, z, w)).matrix
+
+
+_OPEN = 1e-9  # bound of a speed from which on it is free [m/s], [rad/s]
+
+
+class MujocoLocks:
+    """Limits of furniture that depend on the state, such as locks, as ranges of joints in each time step.
+
+    A position ends at its bound. A speed whose bound is 0 is locked: the joint ends where it is. A position
+    beyond a bound that comes is not pushed back, but moves no further away from it. These are the laws of the
+    kinematic world. Other bounds of speeds do nothing.
+    """
+
+    def __init__(self, model: ModelView, robot: Robot, leave_out: Collection[str]) -> None:
+        self._default = model.default_state()
+        self._found: dict[str, tuple[Symbol, Constraint]] = {}
+        for name, constraint in model.constraints.items():
+            symbols, line = constraint.expression.symbols, constraint.line
+            if not _bound_symbols(constraint) or name in leave_out or len(symbols) != 1 or line is None:
+                continue
+            (symbol,) = symbols
+            coordinate = symbol.position if symbol.order else symbol
+            if symbol.order <= 1 and coordinate.has_derivative and not robot.moves(coordinate):
+                self._found[name] = coordinate, constraint
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the constraints."""
+        return tuple(self._found)
+
+    def keep(self, address: Mapping[Symbol, int]) -> tuple[str, ...]:
+        """Keep the limits of joints by the positions of joints, and return the names of the others."""
+        known = {name: {q, *_bound_symbols(c)} <= address.keys() for name, (q, c) in self._found.items()}
+        self._found = {name: one for name, one in self._found.items() if known[name]}
+        return tuple(name for name, is_known in known.items() if not is_known)
+
+    def connect(self, compiled: Any, address: Mapping[Symbol, int]) -> None:
+        """Find the joints in the final ``MjModel``."""
+        found = list(self._found.values())
+        self._compiled = compiled
+        self._at = np.array([address[q] for q, _ in found], dtype=int)
+        joint_at = {int(at): k for k, at in enumerate(compiled.jnt_qposadr)}
+        joints = np.array([joint_at[at] for at in self._at.tolist()], dtype=int)
+        self._joints, self._rows = np.unique(joints, return_inverse=True)
+        limited = compiled.jnt_limited[self._joints].astype(bool)
+        ranges = compiled.jnt_range[self._joints]
+        self._range: Array = np.where(limited[:, None], ranges, (-math.inf, math.inf))
+        compiled.jnt_limited[self._joints] = 1
+        self._is_speed = np.array([c.order > 0 for _, c in found], dtype=bool)
+        lines = np.array([c.line for _, c in found], dtype=float).reshape(-1, 2)
+        self._slope, self._offset = lines.T
+        function = compile([array([getattr(c, end) for _, c in found]) for end in ("lower", "upper")])
+        self._bounds = function.bind()
+        self._bounds.input[:] = [self._default[s] for s in function.inputs]
+        moving = [k for k, s in enumerate(function.inputs) if s in address]
+        self._moving = np.array(moving, dtype=int)
+        self._sources = np.array([address[function.inputs[k]] for k in moving], dtype=int)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget what has been beyond a bound."""
+        self._lower = np.full(len(self._at), -math.inf)
+        self._upper = np.full(len(self._at), math.inf)
+
+    def update(self, data: Any) -> None:
+        """Set the ranges of the joints for the next time step."""
+        if not len(self._at):
+            return
+        self._bounds.input[self._moving] = data.qpos[self._sources]
+        self._bounds()
+        ends = (np.array(self._bounds.outputs) - self._offset) / self._slope
+        low, high = np.minimum(*ends), np.maximum(*ends)
+        low[self._is_speed & (low < -_OPEN)], high[self._is_speed & (high > _OPEN)] = -math.inf, math.inf
+        blocked_low, blocked_high = self._is_speed & (low > -math.inf), self._is_speed & (high < math.inf)
+        low[blocked_low], high[blocked_high] = math.inf, -math.inf
+        q = data.qpos[self._at]
+        # A joint that is held on both sides stays there, though it yields a bit to whatever presses on it.
+        pinned = blocked_low & blocked_high & np.isfinite(self._lower) & np.isfinite(self._upper)
+        self._lower = np.where(pinned, self._lower, np.minimum(low, np.maximum(self._lower, q)))
+        self._upper = np.where(pinned, self._upper, np.maximum(high, np.minimum(self._upper, q)))
+        result, rows = self._range.copy(), self._rows
+        # What is held at an end of its range is held there, and not where it yields beyond.
+        np.maximum.at(result[:, 0], rows, np.minimum(self._lower, self._range[rows, 1]))
+        np.minimum.at(result[:, 1], rows, np.maximum(self._upper, self._range[rows, 0]))
+        self._compiled.jnt_range[self._joints] = result
+
+
+def _bound_symbols(constraint: Constraint) -> set[Symbol]:
+    """Return the symbols of the bounds that change: parameters do not."""
+    both = (*constraint.lower.symbols, *constraint.upper.symbols)
+    return {s for s in both if s.has_derivative or s.order}
 
 
 class MujocoContacts:

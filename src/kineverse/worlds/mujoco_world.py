@@ -13,7 +13,7 @@ from kineverse._checks import finite_number
 from kineverse.errors import InvalidValueError, SimulationError, UnknownNameError, suggest
 from kineverse.formats.mjcf.mujoco_api import mujoco
 from kineverse.grasping.gripper_detection import Gripper
-from kineverse.lie import Array
+from kineverse.lie import Array, inverse, transform
 from kineverse.model.model_view import ModelView
 from kineverse.state import State, StateLike
 from kineverse.symbols import Symbol
@@ -21,12 +21,21 @@ from kineverse.symbols import Symbol
 from . import mujoco_model
 from .mujoco_model import add_floor
 from .mujoco_servos import BANDWIDTH, GripperDrive, JointServos, SpeedMap, base_coordinates
-from .mujoco_state import MujocoContacts, MujocoCoordinates
+from .mujoco_state import MujocoContacts, MujocoCoordinates, MujocoLocks
 from .robot import Robot
 from .robot_interface import Observation
 from .sensor_sampler import SensorSampler
 from .sensors import Sensors
-from .simulated_world import Contact
+from .simulated_world import (
+    DEEPER,
+    SAME_PLACE,
+    Contact,
+    carried_sensors,
+    carried_state,
+    displaced_state,
+    refuse_overlap,
+    saved_time,
+)
 from .speed_commands import ROUNDING, SpeedCommands, check_settings
 
 _MARGIN = 10.0
@@ -176,10 +185,17 @@ class MujocoWorld:
         self._remarks: dict[str, None] = {}
         furniture = [s.path for s in model.degrees_of_freedom if not robot.moves(s)]
         frictions = _friction_by_name(door_friction or {}, furniture)
+        self._left_out = left_out = tuple(leave_out)
+        self._settings: dict[str, Any] = {
+            "gripper": gripper, "step": step, "grip": grip, "friction": friction, "grasp": grasp,
+            "timeout": timeout, "delay": delay, "door_friction": frictions, "bandwidth": bandwidth,
+            "press": press, "floor": floor, "seed": seed,
+        }  # fmt: skip
         if gripper is None:
             gripper = next(iter(robot.grippers), None)
         fingers = () if gripper is None else gripper.fingers
-        spec = mujoco_model.export_spec(model, leave_out, self._remark)
+        self._locks = MujocoLocks(model, robot, left_out)
+        spec = mujoco_model.export_spec(model, left_out, self._locks.names, self._remark)
         spec.option.timestep = self._step
         mujoco_model.add_masses(spec, self._remark)
         mujoco_model.remark_missing_shapes(spec, self._is_robot, self._remark)
@@ -193,6 +209,8 @@ class MujocoWorld:
         self._remark(f"gravity does not act on '{robot.name}': its servos are taken to carry the weight")
         compiled = mujoco_model.compile_world(spec)
         self._coordinates = MujocoCoordinates(model, compiled)
+        for name in self._locks.keep(self._coordinates.address):
+            self._remark(f"'{name}' is not enforced: it is about something else than positions of joints")
         pairs = mujoco_model.exclude_overlaps(
             spec, compiled, model, self._coordinates, self._is_robot, _SAMPLES, seed
         )
@@ -206,7 +224,7 @@ class MujocoWorld:
         else:
             self._remark("there is no floor, as asked for")
         compiled = mujoco_model.compile_world(spec)
-        self._drive = None
+        self._drive, self._gripper = None, gripper
         if gripper is None:
             self._remark(f"no gripper of '{robot.name}' is known, so it holds nothing")
         else:
@@ -232,6 +250,7 @@ class MujocoWorld:
         self._data = mujoco().MjData(self._compiled)
         self._contacts = MujocoContacts(self._compiled, self._is_robot, fingers)
         self._servos.connect(self._compiled)
+        self._locks.connect(self._compiled, self._coordinates.address)
         self._bounds = SimulationBounds(
             self._compiled, self._coordinates, model, self._servos.efforts, robot, self._is_robot
         )
@@ -294,10 +313,103 @@ class MujocoWorld:
         self._broken = ""
         self._commands.reset()
         self._servos.reset(data)
+        self._locks.reset()
         if self._drive is not None:
             self._drive.reset(data)
         engine.mj_forward(self._compiled, data)
         self._sampler.reset()
+
+    @property
+    def sensors(self) -> Sensors:
+        """Settings of the sensors; others take effect with the next readings."""
+        return self._sampler.sensors
+
+    @sensors.setter
+    def sensors(self, sensors: Sensors) -> None:
+        self._sampler.change(sensors)
+
+    def displace(self, values: StateLike) -> None:
+        """Move furniture as a person does, see :meth:`.ChangeableWorld.displace`."""
+        engine, data, coordinates = mujoco(), self._data, self._coordinates
+        state = displaced_state(self, values)
+        qpos, qvel = data.qpos.copy(), data.qvel.copy()
+        before = {(c.a, c.b): c.distance for c in self.contacts()}
+        moved = [s for s in state if state[s] != self.state[s]]
+        data.qpos[:] = coordinates.positions(state)
+        columns = [coordinates.dof[s] for s in moved if s in coordinates.dof]
+        data.qvel[np.any(coordinates.followers[:, columns] != 0.0, axis=1)] = 0.0
+        engine.mj_forward(self._compiled, data)
+        for contact in self.contacts():
+            allowed = DEEPER[0] if self._is_robot(contact.a) else DEEPER[1]
+            if contact.distance < min(before.get((contact.a, contact.b), 0.0), 0.0) - allowed:
+                data.qpos[:], data.qvel[:] = qpos, qvel
+                engine.mj_forward(self._compiled, data)
+                raise refuse_overlap(contact.a, contact.b, values)
+        self._locks.reset()
+        self._state = None
+
+    def resume(self, state: StateLike, held: str | None = None) -> None:
+        """Go on from a state that was saved, see :meth:`.ChangeableWorld.resume`."""
+        self.reset(state)
+        self._ticks = round(saved_time(state) / self._step)
+        self._end = self.time
+        if held is not None:
+            self._hold(held)
+
+    def _hold(self, body: str) -> None:
+        """Press a body that a finger touches."""
+        gripper, drive, data = self._gripper, self._drive, self._data
+        if gripper is None or drive is None:
+            return
+        fingers = {name for finger in gripper.fingers for name in finger}
+        if any(c.a in fingers and c.b == body for c in self.contacts()):
+            drive.hold(data, body)
+            mujoco().mj_forward(self._compiled, data)
+
+    def take_over(self, other: MujocoWorld) -> None:
+        """Go on where another world is, see :meth:`.ChangeableWorld.take_over`; speeds are kept."""
+        data, coordinates, held = self._data, self._coordinates, other.held
+        before = other._place_in_hand(held)
+        self.resume(carried_state(other, self.model))
+        free = np.zeros(self._compiled.nv)
+        for symbol, dof in coordinates.dof.items():
+            if symbol in other._coordinates.dof:
+                free[dof] = other._data.qvel[other._coordinates.dof[symbol]]
+        data.qvel[:] = coordinates.followers @ free
+        self._servos.take_over(other._servos, data)
+        self._commands.take_over(other._commands)
+        self._sampler.take_over(other._sampler, carried_sensors(other.sensors, self.model))
+        self._end = self.time
+        mujoco().mj_forward(self._compiled, data)
+        after = self._place_in_hand(held)
+        if held is not None and before is not None and after is not None:
+            if np.allclose(before, after, rtol=0.0, atol=SAME_PLACE):
+                self._hold(held)
+
+    def _place_in_hand(self, body: str | None) -> Array | None:
+        """Return the pose of a body in the hand (4, 4); None without one."""
+        engine, compiled, data = mujoco(), self._compiled, self._data
+        if self._gripper is None or body is None:
+            return None
+        if engine.mj_name2id(compiled, engine.mjtObj.mjOBJ_BODY, body) < 0:
+            return None
+        result = []
+        for name in (self._gripper.hand, body):
+            k = compiled.body(name).id
+            result.append(transform(data.xmat[k].reshape(3, 3), data.xpos[k]))
+        place: Array = inverse(result[0]) @ result[1]
+        return place
+
+    def rebuild(self, model: ModelView) -> MujocoWorld:
+        """Return a world of another model that goes on where this one is."""
+        kept = [name for name in self._left_out if name in model.constraints]
+        known = {s.path for s in model.degrees_of_freedom}
+        settings = dict(self._settings)
+        settings["door_friction"] = {k: v for k, v in settings["door_friction"].items() if k in known}
+        sensors = carried_sensors(self.sensors, model)
+        result = MujocoWorld(model, self.robot, sensors=sensors, leave_out=kept, **settings)
+        result.take_over(self)
+        return result
 
     def apply(self, speeds: StateLike, duration: float, *, stamp: float | None = None) -> None:
         """Advance by a duration with speeds of the robot, as :meth:`.RobotInterface.apply`.
@@ -365,6 +477,7 @@ class MujocoWorld:
         self._servos.drive(data, rates[: self._count])
         if self._drive is not None:
             self._drive.drive(data, rates[self._count :])
+        self._locks.update(data)
         mujoco().mj_step(self._compiled, data)
         self._ticks += 1
 

@@ -17,6 +17,10 @@ where it led, until nothing changes (sequential quadratic programming).
 What the robot moves does not run through other furniture: gaps between furniture are rows of the same kind
 with slacks of more weight, so that the robot penetrates an object that something else blocks, and the object
 does not penetrate that.
+
+A spring that its friction does not hold moves its coordinate with a speed u that takes the place of rest: the
+cost is 1/2 Σ w_i (v_i - u_i)². So the robot is stronger than any spring, and a body in the hand follows the
+hand.
 """
 
 from __future__ import annotations
@@ -46,12 +50,14 @@ from .quasistatic_constraints import (
     FurnitureGaps,
     Gaps,
     ObjectLimits,
+    ObjectSprings,
     Rows,
     align_motion,
     pair_keys,
     project_twists,
 )
 from .robot import Robot
+from .simulated_world import DEEPER
 
 SKIN = 1e-6  # gap to which objects are pushed [m]: below, normals of nearest points are not determined
 _REACH = 0.005  # distance beyond the robot's motion up to which gaps are rows [m]
@@ -101,6 +107,7 @@ class ObjectMotion:
         self._integrate = model.integrator(speeds, self.symbols)
         self._limits = ObjectLimits(model, speeds, robot, leave_out)
         self.skipped = self._limits.skipped
+        self.springs = ObjectSprings(model, speeds, robot)
         self._furniture = FurnitureContacts(
             overlaps, speeds, self.group, self._evaluate_twists, self._limits.link
         )
@@ -143,6 +150,7 @@ class ObjectMotion:
         """Start again at a configuration."""
         self._penetrated.clear()
         self._limits.reset()
+        self.springs.reset()
         self.place(q)
         self.overlaps.begin()
         self.ignore()
@@ -157,6 +165,11 @@ class ObjectMotion:
         """Return the distances that shapes of the robot have moved so far, at most (K,) [m]."""
         travel: Array = self.scene.collision_world.table.travel[self._robot_objects]
         return travel
+
+    def spring_travel(self, h: float) -> float:
+        """Return the longest motion of a body by its spring in a time h [s], if nothing is in its way [m]."""
+        motion = np.abs(self.springs.wish(self.q, h)) * np.sqrt(self.weights[: self.count])
+        return float(motion.max(initial=0.0)) * h
 
     def longest_motion(self, moved: Array, radius: float) -> float | None:
         """Return the longest motion of a body in a pair within a radius [m]; None without such a pair."""
@@ -182,6 +195,29 @@ class ObjectMotion:
         pairs, index = self.find_near(0.0)
         keys = pair_keys(pairs) if len(index) else []
         self._before = {keys[k]: float(pairs.distances[k]) for k in index.tolist()}
+
+    def displace(self, q: Array) -> tuple[str, str] | None:
+        """Move objects to a configuration, unless that leads into a body: then return the two bodies."""
+        self.settle()
+        start, before = self.q.copy(), self._find_meeting()
+        self.place(q)
+        pairs, index = self.find_near(0.0)
+        keys = pair_keys(pairs) if len(index) else []
+        for k in index.tolist():
+            if pairs.distances[k] < self._before.get(keys[k], 0.0) - DEEPER[0]:
+                self.place(start)
+                return pairs[k].a, pairs[k].b
+        for pair, depth in self._find_meeting().items():
+            if depth > before.get(pair, 0.0) + DEEPER[1]:
+                self.place(start)
+                return pair
+        self.settle()
+        return None
+
+    def _find_meeting(self) -> dict[tuple[str, str], float]:
+        """Return the depths of furniture in furniture by pair of bodies [m]."""
+        found = reversed(self.overlaps.find_beyond(0.0))
+        return {(one.a, one.b): -one.distance - allowed for one, allowed in found}
 
     def find_near(self, radius: float) -> tuple[DistanceResults, npt.NDArray[np.intp]]:
         """Return the pairs within a radius [m], and the indices of those that are not ignored."""
@@ -255,12 +291,12 @@ class ObjectMotion:
         return twists
 
     def _measure_furniture(
-        self, v: Array, gaps: Gaps, pulled: tuple[Array, Array] | None
+        self, v: Array, wish: Array, gaps: Gaps, pulled: tuple[Array, Array] | None
     ) -> FurnitureGaps | None:
         """Return the gaps between furniture, some of which moves; None if nothing does."""
         n = self.count
         rows = gaps.rows[:, :n] != 0.0
-        driven = rows[(gaps.distances < _DEEP) & ~gaps.jammed].any(axis=0)
+        driven = rows[(gaps.distances < _DEEP) & ~gaps.jammed].any(axis=0) | (wish != 0.0)
         if pulled is not None:
             driven |= (pulled[1] != 0.0).any(axis=0)
         moved = driven | rows.any(axis=0) | (v != 0.0)
@@ -269,8 +305,9 @@ class ObjectMotion:
     def resolve(self, h: float, moved: float, residual: Residual | None = None) -> Array:
         """Move the objects after the robot has moved, and return their speeds (n,)."""
         v = best = np.zeros(self.count)
-        start, radius, least = self.q.copy(), moved + _REACH, math.inf
-        if residual is None and not len(self.find_near(0.0)[1]):
+        start, least, wish = self.q.copy(), math.inf, self.springs.wish(self.q, h)
+        radius = moved + self.spring_travel(h) + _REACH
+        if residual is None and not wish.any() and not len(self.find_near(0.0)[1]):
             return v
         rates = self._limits.begin(start, h)
         self._furniture.begin()
@@ -278,8 +315,8 @@ class ObjectMotion:
             gaps = self.measure_gaps(radius)
             pulled = None if residual is None else residual()
             limits, beyond = self._limits.position_rows(self.q, h, v)
-            aims, furniture = self._aims(gaps, h), self._measure_furniture(v, gaps, pulled)
-            cost = self._cost(h * v, gaps, aims, furniture, pulled) + beyond / _HARD
+            aims, furniture = self._aims(gaps, h), self._measure_furniture(v, wish, gaps, pulled)
+            cost = self._cost(h * (v - wish), gaps, aims, furniture, pulled) + beyond / _HARD
             better = cost <= least * (1.0 + 1e-9)
             if k == _ROUNDS:
                 break
@@ -288,7 +325,7 @@ class ObjectMotion:
                 self._note_penetrated(gaps)
                 result = v
                 if furniture is not None:
-                    result = self._solve(h, v, gaps, aims, furniture, rates, limits, pulled)
+                    result = self._solve(h, v, wish, gaps, aims, furniture, rates, limits, pulled)
             else:
                 # The gaps bend too much, as of bodies that are jammed: half of the motion.
                 result = 0.5 * (best + v)
@@ -301,6 +338,10 @@ class ObjectMotion:
             v = best
             self.place(self._integrate(start, v, h))
         self._limits.finish(self.q, h)
+        sprung = np.flatnonzero(wish)
+        if len(sprung) and residual is None and not gaps.rows[:, sprung].any():
+            if (h * np.abs(v) * np.sqrt(self.weights[: self.count]) < _STEADY).all():
+                self.springs.block(self.q)
         return v
 
     def _cost(
@@ -311,7 +352,7 @@ class ObjectMotion:
         furniture: FurnitureGaps | None,
         pulled: tuple[Array, Array] | None,
     ) -> float:
-        """Return twice the cost of a motion by some motion of the objects (n,)."""
+        """Return twice the cost of a motion of the objects (n,), relative to that by their springs."""
         depths = np.minimum(gaps.distances - np.minimum(aims, 0.0), 0.0)[~gaps.jammed]
         moved = float(self.weights[: self.count] @ motion**2)
         if pulled is not None:
@@ -326,6 +367,7 @@ class ObjectMotion:
         self,
         h: float,
         v: Array,
+        wish: Array,
         gaps: Gaps,
         aims: Array,
         furniture: FurnitureGaps,
@@ -337,11 +379,12 @@ class ObjectMotion:
         n = self.count
         G, d = gaps.rows[:, :n], gaps.distances
         use, *concerned = self._limits.find_linked(furniture.moved)
-        H, f = np.diag(self.weights[use]), np.zeros(len(use))
+        H, f = np.diag(self.weights[use]), -self.weights[use] * wish[use]
         if pulled is not None:
             error, J = pulled[0] / h, pulled[1][:, use]
             mine = (J != 0.0).any(axis=0)
             H[mine, mine] *= _HELD
+            f[mine] *= _HELD
             H += J.T @ J
             f += J.T @ (error - J @ v[use])
         parts = []

@@ -1,4 +1,4 @@
-"""Constraints of a quasi-static step: gaps between bodies, and limits, locks and closures of objects.
+"""Constraints of a quasi-static step: gaps between bodies, limits, locks and closures of objects, springs.
 
 What a robot moves pushes other furniture along, and stops where that cannot yield. It does not push what
 its contact jams: where the normal is 60° or more off the motion that a coordinate causes there.
@@ -6,6 +6,7 @@ its contact jams: where the normal is 60° or more off the motion that a coordin
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple, TypeAlias
@@ -13,12 +14,14 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
+from kineverse._checks import finite_number
 from kineverse.compilation import compile
 from kineverse.expressions.expression import array
 from kineverse.geometry.distance_queries import PreparedQuery
 from kineverse.geometry.results import DistanceResults
 from kineverse.lie import Array
 from kineverse.model.constraint import Constraint
+from kineverse.model.frame_dependence import FrameDependence
 from kineverse.model.model_view import ModelView
 from kineverse.model.projection import is_equality
 from kineverse.model.velocity_constraints.velocity_rows import Recovery, VelocityRows, velocity_rows
@@ -201,6 +204,85 @@ def _link_columns(count: int, patterns: Sequence[npt.NDArray[np.bool_]]) -> npt.
     for k in range(count):  # transitive closure (Warshall)
         linked |= np.outer(linked[:, k], linked[k])
     return linked
+
+
+_UNLIMITED = 1.0  # speed of a spring whose coordinate has no limit of its speed [m/s], [rad/s]
+_LIFT = (2, 3, 4)  # rows of a twist that lift something: v_z, w_x, w_y
+_LIFTS = 1e-9
+_RELAXED = 1e-9  # distance of a spring from its rest that counts as none [m], [rad]
+
+
+class ObjectSprings:
+    """Springs of objects, as the articulations state them by stiffness k, rest r and friction f.
+
+    A spring moves its coordinate q until its force k (r - q) is at most the friction, with the limit of the
+    speed. A spring whose coordinate lifts something with a stated mass carries a weight. This is not known
+    here, so such a spring does nothing.
+    """
+
+    def __init__(self, model: ModelView, speeds: Sequence[Symbol], robot: Robot) -> None:
+        place = {s: k for k, s in enumerate(model.symbols)}
+        found: list[tuple[int, int, float, float, float]] = []
+        skipped: list[str] = []
+        for record in model.articulations.values():
+            for q in record.coordinates:
+                known, v = record.dynamics_of(q), q.derivative()
+                stiffness = finite_number(known.get("spring_stiffness", known.get("stiffness")))
+                rest = finite_number(known.get("spring_reference", known.get("rest", 0.0)))
+                friction = finite_number(known.get("friction", 0.0))
+                if v not in speeds or rest is None or friction is None:
+                    continue
+                if stiffness is None or not stiffness > 0.0:
+                    continue
+                if _carries_weight(model, v, robot):
+                    skipped.append(str(q))
+                    continue
+                slack, fastest = friction / stiffness, float(np.abs(model.limits(v)).min())
+                speed = fastest if 0.0 < fastest < math.inf else _UNLIMITED
+                found.append((speeds.index(v), place[q], rest - slack, rest + slack, speed))
+        self.skipped = tuple(skipped)
+        self._count = len(speeds)
+        columns = np.array(found, dtype=float).reshape(-1, 5).T
+        self._columns, self._places = columns[0].astype(np.intp), columns[1].astype(np.intp)
+        self._low, self._high, self._speeds = columns[2:]
+        limits = [model.limits(model.symbols[k]) for k in self._places.tolist()]
+        self._limits = np.array(limits, dtype=float).reshape(-1, 2).T
+        others = [k for k, s in enumerate(model.symbols) if not robot.moves(s)]
+        self._others = np.array(others, dtype=np.intp)
+        self._blocked: Array | None = None
+
+    def reset(self) -> None:
+        """Forget where springs were blocked."""
+        self._blocked = None
+
+    def wish(self, q: Array, h: float) -> Array:
+        """Return the speeds (n,) with which springs move objects at values of the symbols in a time h [s]."""
+        result = np.zeros(self._count)
+        if not len(self._columns) or (
+            self._blocked is not None and np.array_equal(self._blocked, q[self._others])
+        ):
+            return result
+        at = q[self._places]
+        target = np.clip(np.clip(at, self._low, self._high), *self._limits)
+        way = np.where(np.abs(target - at) < _RELAXED, 0.0, target - at)
+        result[self._columns] = np.clip(way / h, -self._speeds, self._speeds)
+        return result
+
+    def block(self, q: Array) -> None:
+        """Note that limits alone keep all springs where they are, until another object moves."""
+        self._blocked = q[self._others].copy()
+
+
+def _carries_weight(model: ModelView, speed: Symbol, robot: Robot) -> bool:
+    """Return whether a speed lifts a body of the objects with a stated mass."""
+    motion, home = FrameDependence(model, [speed]), model.default_state()
+    for name, body in model.bodies.items():
+        if body.inertia is None or not body.inertia.mass > 0.0 or robot.owns(name) or not motion.moves(name):
+            continue
+        twist = compile(model.jacobian(name, form="world", symbols=[speed]), tier="interpreter")(home)
+        if (np.abs(twist[_LIFT, 0]) > _LIFTS).any():
+            return True
+    return False
 
 
 RESTING = OVERLAP / 2  # depth beyond the allowance at which furniture stops [m]: resting shapes slide freely

@@ -133,22 +133,35 @@ class SensorSampler:
     """
 
     def __init__(self, sensors: Sensors, model: ModelView, robot: Robot | str, seed: int = 0) -> None:
-        self.sensors, self._seed = sensors, seed
+        self._seed, self._model = seed, model
         self._robot = robot = Robot.of(model, robot)
-        self.camera, self.marked = sensors.find_frames(robot)
+        self._joints = tuple(s for s in model.symbols if robot.moves(s) and not s.order)
+        self._base = () if robot.base is None else robot.base.coordinates
+        self._encoded = tuple(s for s in self._joints if s not in set(self._base))
+        self._sight: LineOfSight | None = None
+        self.camera, self.marked = "", tuple[str, ...]()
+        self._configure(sensors)
+        self.reset()
+
+    def _configure(self, sensors: Sensors) -> None:
+        robot = self._robot
+        camera, marked = sensors.find_frames(robot)
         known = sensors.camera or robot.camera
         if not known and (sensors.field_of_view is not None or sensors.sight):
             raise InvalidValueError(
                 f"What is visible depends on a camera, and no frame of '{robot.name}' is named like one. "
                 f"Name it by camera=. {suggest('head', robot.frames, 'frame')}"
             )
-        self._joints = tuple(s for s in model.symbols if robot.moves(s) and not s.order)
-        self._base = () if robot.base is None else robot.base.coordinates
-        self._encoded = tuple(s for s in self._joints if s not in set(self._base))
-        # Compiled for the first picture: many worlds are never observed.
-        self._seen = [model.fk(name) for name in (self.camera, *self.marked)]
-        self._sight = LineOfSight(robot, self.camera, self.marked) if sensors.sight else None
-        self.reset()
+        if (camera, marked) != (self.camera, self.marked):
+            self._sight, self.camera, self.marked = None, camera, marked
+            # Compiled for the first picture: many worlds are never observed.
+            self._seen = [self._model.fk(name) for name in (camera, *marked)]
+            for name in ("_poses", "_camera_pose"):
+                self.__dict__.pop(name, None)
+        if sensors.sight and self._sight is None:
+            self._sight = LineOfSight(robot, camera, marked)
+        self._uncovered = np.array([name not in sensors.hidden for name in marked], dtype=bool)
+        self.sensors = sensors
 
     @cached_property
     def _poses(self) -> CompiledFunction[tuple[Array, ...]]:
@@ -166,6 +179,26 @@ class SensorSampler:
         self._last: Observation | None = None
         self._time, self._picture = -math.inf, -1
         self._true_base = self._read_base = np.empty(0)
+        self._drifts = False
+
+    def change(self, sensors: Sensors) -> None:
+        """Go on with other settings, from the next readings on; the odometry keeps its drift.
+
+        Raises
+        ------
+        UnknownNameError, InvalidValueError
+            As for the settings at first. Nothing has changed then.
+        """
+        self._configure(sensors)
+        self._picture = math.floor(self._time * sensors.rate + 1e-6) if math.isfinite(self._time) else -1
+
+    def take_over(self, other: SensorSampler, sensors: Sensors) -> None:
+        """Go on where another sampler of the same robot is, with its noise and drift, and some settings."""
+        self._configure(sensors)
+        self._encoder_noise, self._odometry_noise = other._encoder_noise, other._odometry_noise
+        self._camera_noise, self._coming, self._last = other._camera_noise, other._coming, other._last
+        self._time, self._picture = other._time, other._picture
+        self._true_base, self._read_base, self._drifts = other._true_base, other._read_base, other._drifts
 
     def observe(self, time: float, state: State, contacts: Iterable[Contact] = ()) -> Observation:
         """Read the sensors, and return the newest readings that have arrived.
@@ -236,9 +269,9 @@ class SensorSampler:
             step[:2] = rotation_z(self._read_base[2])[:2, :2] @ step[:2]
         else:
             step += self.sensors.odometry * noise * np.sqrt(np.abs(step))
-        exact = self.sensors.odometry == self.sensors.turn == 0.0
+        self._drifts |= bool(self.sensors.odometry or self.sensors.turn)
         self._true_base = base
-        self._read_base = base.copy() if exact else self._read_base + step
+        self._read_base = self._read_base + step if self._drifts else base.copy()
         return self._read_base
 
     def _take_picture(self, state: State, joints: dict[Symbol, float]) -> dict[str, Array]:
@@ -262,12 +295,12 @@ class SensorSampler:
             np.array([joints[s] if s in joints else state[s] for s in self._camera_pose.inputs])
         )
         observed = read_T_camera @ inverse(world_T_camera) @ observed
-        seen = uniform[:, 0] >= sensors.drop
+        seen = (uniform[:, 0] >= sensors.drop) & self._uncovered
         if sensors.field_of_view is not None:
             # The z axis of optical frames looks forward (REP 103).
             forward = world_T_camera[:3, 2 if "optical" in self.camera else 0]
             seen &= apart @ forward >= math.cos(0.5 * sensors.field_of_view) * distances
-        if self._sight is not None:
+        if sensors.sight and self._sight is not None:
             self._sight.update(state)
             for k in np.flatnonzero(seen):
                 seen[k] = self._sight.sees(self.marked[k], world_T_camera[:3, 3])

@@ -69,6 +69,8 @@ class Sensors:
         Whether bodies hide markers behind them; needs the extra ``geometry``.
     marked
         Frames with markers; by default the bodies of articulated objects, and the bodies that carry them.
+    hidden
+        Frames whose markers are not seen, as if somebody had covered them.
 
     Raises
     ------
@@ -94,6 +96,7 @@ class Sensors:
     field_of_view: float | None = field(default=None, metadata={"most": 2.0 * math.pi})
     sight: bool = False
     marked: tuple[str, ...] | None = None
+    hidden: frozenset[str] = frozenset()
 
     _POSITIVE: ClassVar = ("rate", "reach", "field_of_view")
 
@@ -107,10 +110,15 @@ class Sensors:
         if self.camera is not None and not isinstance(self.camera, str):
             raise InvalidValueError(f"camera= is the name of a frame, not {self.camera!r}.")
         if self.marked is not None:
-            names = (self.marked,) if isinstance(self.marked, str) else tuple(self.marked)
-            if not all(isinstance(name, str) for name in names):
-                raise InvalidValueError(f"marked= takes names of frames, not {self.marked!r:.80}.")
-            object.__setattr__(self, "marked", names)
+            object.__setattr__(self, "marked", self._names("marked"))
+        object.__setattr__(self, "hidden", frozenset(self._names("hidden")))
+
+    def _names(self, field: str) -> tuple[str, ...]:
+        given = getattr(self, field)
+        names = (given,) if isinstance(given, str) else tuple(given)
+        if not all(isinstance(name, str) for name in names):
+            raise InvalidValueError(f"{field}= takes names of frames, not {given!r:.80}.")
+        return names
 
     def _check_number(self, name: str, given: Any, most: float) -> None:
         number = finite_number(given)
@@ -134,7 +142,7 @@ class Sensors:
         camera = self.camera or robot.camera or next(iter(robot.frames), WORLD)
         marked = robot.markers if self.marked is None else self.marked
         frames = robot.model.frames
-        for name in (camera, *marked):
+        for name in (camera, *marked, *sorted(self.hidden)):
             if name not in frames and name != WORLD:
                 raise UnknownNameError(f"There is no frame '{name}'. {suggest(name, frames, 'frame')}")
         return camera, marked
@@ -182,7 +190,7 @@ class Sensors:
         return cls(**result)
 
     def __str__(self) -> str:
-        """Return the settings as a text that :meth:`parse` reads; marked frames are not part of it."""
+        """Return the settings as a text that :meth:`parse` reads, without marked and hidden frames."""
         parts: list[str] = []
         if self.position or self.position_per_metre:
             more = f"+{self.position_per_metre * 1e3:.12g}mm/m" if self.position_per_metre else ""

@@ -51,6 +51,23 @@ class SpeedCommands:
         self._last = self._active = _Command(np.zeros(len(self._fingers)), 0.0, 0.0, 0.0)
         self._coming: deque[_Command] = deque()
 
+    def take_over(self, other: SpeedCommands) -> None:
+        """Go on with the commands of another world, whose robot has the same speeds or some of them."""
+        both = [
+            (mine, theirs)
+            for name, mine in self._columns.items()
+            if isinstance(name, str) and mine is not None and (theirs := other._columns.get(name)) is not None
+        ]
+        mine, theirs = np.array(both, dtype=int).reshape(-1, 2).T
+
+        def carry(command: _Command) -> _Command:
+            vector = np.zeros(len(self._fingers))
+            vector[mine] = command.speeds[theirs]
+            return command._replace(speeds=vector)
+
+        self.refused, self._last, self._active = other.refused, carry(other._last), carry(other._active)
+        self._coming = deque(map(carry, other._coming))
+
     def take(self, speeds: StateLike, duration: float, stamp: float | None, now: float) -> float:
         """Take speeds for a duration [s], and return its end; those with a stale stamp stop the robot."""
         until = end = now + as_positive(duration, "A duration", "number of seconds")

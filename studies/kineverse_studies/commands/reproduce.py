@@ -42,6 +42,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--processes", metavar="N", type=int, help="number of processes (cores)")
     add("--world", default="kinematic", help="kinematic (the default), mujoco, or both")
     add("--noise", metavar="NOISE", help=f"noise of the sensors, such as {noise} (none: the truth)")
+    add("--ros", action=flag, help="the robot is only topics of ROS 2")
     add("--record", metavar="FOLDER", type=Path, help="folder for a recording of each trial")
     figure, form = parser.add_mutually_exclusive_group(), parser.add_mutually_exclusive_group()
     where = "file of the figure (NAME.png; with --json, --markdown: none)"
@@ -67,9 +68,10 @@ def run(arguments: argparse.Namespace) -> int:
     needed = REQUIRED_EXTRAS.get(arguments.name, ())
     extras = {
         "control": "control" in needed,
+        "exchange": "exchange" in needed,
         "figures": arguments.figure is not None,
         "geometry": "geometry" in needed,
-        "mjcf": "geometry" in needed and arguments.world != "kinematic",
+        "mjcf": "mjcf" in needed or ("geometry" in needed and arguments.world != "kinematic"),
         "recording": arguments.record is not None,
     }
     require(f"kineverse reproduce {arguments.name}", extras, compiler=arguments.name in PLANNED)

@@ -61,6 +61,19 @@ class HingedDoor(Mechanism):
         first, second = (box_shape(size, (0.0, y, self.height / 2), PALE) for y in places)
         return first, second
 
+    def check_spring(self) -> None:
+        """Check the fields ``stiffness`` and ``rest`` of the spring that returns a part to 0."""
+        self.number("stiffness", positive=True)
+        if (rest := self.number("rest")) > 0:
+            raise InvalidValueError(
+                f"{self.describe('rest')} is at 0 or before it, where the spring pushes to, and not at "
+                f"{rest:g}."
+            )
+
+    def spring(self, part: str) -> tuple[tuple[str, Any], ...]:
+        """Return the parameters of the spring that returns a part to 0."""
+        return ((f"{part}/stiffness", self.number("stiffness")), (f"{part}/rest", self.number("rest")))
+
 
 @dataclass(frozen=True, kw_only=True)
 class DoorWithHandle(HingedDoor, document_kind="DoorWithHandle"):
@@ -72,6 +85,7 @@ class DoorWithHandle(HingedDoor, document_kind="DoorWithHandle"):
     frames            ``base``, ``door``, ``handle``
     ``name/lock``     -speed <= q̇ <= speed·unlocked: closing is always free
     unlocked          (h > threshold) | ~(q < shut)
+    record            ``handle/stiffness`` [N m/rad], ``handle/rest`` [rad]
     ================  ======================================================================
 
     Attributes
@@ -86,12 +100,16 @@ class DoorWithHandle(HingedDoor, document_kind="DoorWithHandle"):
         Limit of the angular speed of the door [rad/s].
     handle_height
         Height of the handle above the floor [m].
+    stiffness
+        Stiffness of the spring that lifts the handle, with the torque stiffness·(rest - h) [N m/rad].
+    rest
+        Angle at which it is slack [rad], before 0: it lifts the handle to its stop.
 
     Raises
     ------
     InvalidValueError
         For lengths that are not positive, a door that is not shut at 0, a threshold that the handle does not
-        reach, or a handle above the door.
+        reach, a handle above the door, or a spring that does not lift the handle to 0.
     """
 
     door: Limits = Limits(0.0, 1.9)
@@ -100,11 +118,14 @@ class DoorWithHandle(HingedDoor, document_kind="DoorWithHandle"):
     shut: float = 0.01
     speed: float = 1.5
     handle_height: float = 1.0
+    stiffness: float = 1.5
+    rest: float = -0.3
 
     def __post_init__(self) -> None:
         super().__post_init__()
         self.check_lengths("shut", "speed", "handle_height")
         self.check_threshold("threshold", self.handle)
+        self.check_spring()
         if not self.handle_height < self.height:
             raise InvalidValueError(
                 f"{self.describe('handle_height')} is below its height {self.height:g}, and not "
@@ -125,6 +146,10 @@ class DoorWithHandle(HingedDoor, document_kind="DoorWithHandle"):
                 q, open_if=pressed, engaged_if=q < self.shut, max_speed=self.speed, blocks="forward"
             )
         }
+
+    def dynamics(self) -> tuple[tuple[str, Any], ...]:
+        """Return the parameters of the handle's spring."""
+        return self.spring("handle")
 
     def parts(self) -> Mapping[str, MechanismPart]:
         """Return posts, door and handle."""
@@ -159,12 +184,7 @@ class SprungDoor(HingedDoor):
         super().__post_init__()
         self.check_lengths("play")
         self.check_threshold("catch", getattr(self, self.sprung))
-        self.number("stiffness", positive=True)
-        if self.number("rest") > 0:
-            raise InvalidValueError(
-                f"{self.describe('rest')} is at 0 or before it, where the spring pushes to, and not at "
-                f"{self.rest:g}."
-            )
+        self.check_spring()
 
     @property
     def limits(self) -> Mapping[str, Limits]:
@@ -178,7 +198,7 @@ class SprungDoor(HingedDoor):
 
     def dynamics(self) -> tuple[tuple[str, Any], ...]:
         """Return the parameters of the spring."""
-        return ((f"{self.sprung}/stiffness", self.stiffness), (f"{self.sprung}/rest", self.rest))
+        return self.spring(self.sprung)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -218,14 +238,19 @@ class Latch(SprungDoor, document_kind="Latch"):
 
 @dataclass(frozen=True, kw_only=True)
 class Microwave(SprungDoor, document_kind="Microwave"):
-    """Microwave oven: its door stays shut unless the button is pressed; a spring returns the button.
+    """Microwave oven: its door stays shut unless the button is pressed, and then springs ajar.
+
+    The spring of the door opens it as far as the friction of its hinge allows, to door_rest - friction /
+    door_stiffness, 0.1 rad. So it stays ajar once the button is let go. Friction holds the wide open door.
 
     ================  ======================================================================
     ``name/door``     q [rad]: base_T_door = rotation_z(q)
     ``name/button``   b [m]: base_T_button = translation(b, …), 0 at rest
     frames            ``base`` (at the hinge, on the floor of the oven), ``door``, ``button``
     ``name/latch``    q <= 0 unless b > catch or q >= play
-    record            ``button/stiffness`` [N/m], ``button/rest`` [m]
+    record            ``button/stiffness`` [N/m], ``button/rest`` [m], and of the door
+                      ``door/stiffness`` [N m/rad], ``door/rest`` [rad],
+                      ``door/friction`` [N m], ``door/damping`` [N m s/rad]
     ================  ======================================================================
 
     Attributes
@@ -234,6 +259,16 @@ class Microwave(SprungDoor, document_kind="Microwave"):
         Depth of the oven behind its door [m].
     button
         Limits of b.
+    door_stiffness, door_rest
+        Spring of the door, with the torque door_stiffness·(door_rest - q) [N m/rad], [rad].
+    friction, damping
+        Friction [N m] and damping [N m s/rad] of its hinge.
+
+    Raises
+    ------
+    InvalidValueError
+        For lengths that are not positive, a button that does not reach the catch, or a spring that does not
+        open the door beyond ``play``.
     """
 
     sprung: ClassVar[str] = "button"
@@ -247,10 +282,30 @@ class Microwave(SprungDoor, document_kind="Microwave"):
     catch: float = 0.004
     stiffness: float = 500.0
     rest: float = -0.004
+    door_stiffness: float = 3.0
+    door_rest: float = 1.1
+    friction: float = 3.0
+    damping: float = 1.0
 
     def __post_init__(self) -> None:
-        self.check_lengths("depth")
+        self.check_lengths("depth", "door_stiffness", "friction", "damping")
         super().__post_init__()
+        ajar = self.number("door_rest") - self.friction / self.door_stiffness
+        if not ajar > self.play:
+            raise InvalidValueError(
+                f"The spring of the door of the {self.noun} '{self.name}' opens it beyond the play "
+                f"{self.play:g}, and not to {ajar:g}."
+            )
+
+    def dynamics(self) -> tuple[tuple[str, Any], ...]:
+        """Return the parameters of the springs and of the hinge."""
+        spring = ("door/stiffness", self.door_stiffness), ("door/rest", self.door_rest)
+        return (
+            *super().dynamics(),
+            *spring,
+            ("door/friction", self.friction),
+            ("door/damping", self.damping),
+        )
 
     def parts(self) -> Mapping[str, MechanismPart]:
         """Return the oven, its door and its button."""
@@ -259,7 +314,8 @@ class Microwave(SprungDoor, document_kind="Microwave"):
         behind = (t / 2 + depth / 2, w / 2, h / 2)
         out, across = -t / 2 - 0.025, 0.92 * w
         grip = rod_shape((out, across, 0.15 * h), (out, across, 0.85 * h), 0.008, STEEL)
-        side = box_shape((depth + t, controls, h), (depth / 2, w + controls / 2, h / 2), DARK)
+        gap = 0.004  # the corner of the door sweeps over its edge
+        side = box_shape((depth + t, controls - gap, h), (depth / 2, w + (controls + gap) / 2, h / 2), DARK)
         place = shift(-t / 2, w + controls / 2, 0.2 * h), translation_along(X, self.q("button"))
         knob = box_shape((0.02, 0.6 * controls, 0.12 * h), (0.0, 0.0, 0.0), RED)
         return {

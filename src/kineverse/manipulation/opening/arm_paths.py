@@ -20,6 +20,8 @@ from kineverse.model.model_view import ModelView
 from kineverse.state import State
 from kineverse.symbols import Symbol
 
+from .contact_phases import Way
+
 _DAMPING = 1e-6
 _CENTERING = 0.1  # share of the distance to the middle of the limits that a step takes in the null space
 _LONGEST = 0.4  # largest step of a coordinate [m], [rad]
@@ -255,7 +257,7 @@ class CandidatePath:
 
 
 class PathCheck:
-    """Check of paths in one state, of one object."""
+    """Check of paths in one state, of one handle along its way."""
 
     def __init__(
         self,
@@ -263,17 +265,17 @@ class PathCheck:
         paths: CartesianPaths,
         state: State,
         grasps: Sequence[Grasp],
-        values: Array,
+        way: Way,
         handles: Array,
     ) -> None:
         self.contacts, self.paths, self.state, self.grasps = contacts, paths, state, grasps
-        self.values, self.handles = values, handles
-        self.free: npt.NDArray[np.int_] = np.full(len(grasps), len(values) - 1)
+        self.values, self.handles = way.values, handles
+        self.free: npt.NDArray[np.int_] = np.full(len(grasps), len(way) - 1)
         self.reasons = Counter[str]()
         gripper, handle = grasps[0].gripper, grasps[0].handle
         self._gripper, self._frame = gripper, handle.frame
         self._columns: tuple[Symbol, ...] = (
-            *paths.moving, *paths.still, *gripper.joints, handle.coordinate,
+            *paths.moving, *paths.still, *gripper.joints, *way.coordinates,
         )  # fmt: skip
 
     def find_retreat(self, candidate: CandidatePath) -> Array | None:
@@ -292,7 +294,7 @@ class PathCheck:
         back, still = candidate.back, self.paths.still
         home = [self._rows(self.state.vector(self.paths.moving)[None], base, opened, self.values[:1])]
         parts = [
-            (self._rows(back, base, opened, np.full(len(back), self.values[0])), self._frame, True),
+            (self._rows(back, base, opened, self.values[:1]), self._frame, True),
             (self._sweep(grasp, back[0], base, 0), self._frame, False),
             *((rows, "", True) for rows in home if still),
         ]
@@ -338,7 +340,7 @@ class PathCheck:
             path = paths[k, : reached[k]]
             if len(path) < _LEAST_RETREAT:
                 break
-            rows = self._rows(path, base, opened, np.full(len(path), self.values[end]))
+            rows = self._rows(path, base, opened, self.values[end : end + 1])
             # At its end the hand is free: a path begins there.
             parts = ((rows, self._frame), (rows[-1:], ""))
             if all(self._find(part, frame, opened=True) is None for part, frame in parts):
@@ -360,9 +362,13 @@ class PathCheck:
         return rows
 
     def _rows(self, Q: Array, base: Array, fingers: Mapping[Symbol, float], values: Array) -> Array:
-        """Return rows of everything that moves (N, n), with some between neighbouring ones."""
+        """Return rows of everything that moves (N, n), with some between neighbouring ones.
+
+        Values of the handle's coordinates (1, m) stand for all configurations.
+        """
         fixed = [*base, *(fingers[s] for s in self._gripper.joints)]
-        full = np.hstack([Q, np.tile(fixed, (len(Q), 1)), values[:, None]])
+        values = np.broadcast_to(values, (len(Q), values.shape[1]))
+        full = np.hstack([Q, np.tile(fixed, (len(Q), 1)), values])
         share = np.arange(_BETWEEN) / _BETWEEN
         dense = full[:-1, None] + share[:, None] * (full[1:] - full[:-1])[:, None]
         return np.vstack([dense.reshape(-1, full.shape[1]), full[-1:]])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from heapq import heappop, heappush
 from itertools import count
 from time import perf_counter
@@ -36,6 +36,7 @@ from .arm_paths import (
     find_highest_reach,
     interpolate_poses,
 )
+from .contact_phases import Way
 
 NO_PATH, NO_PLACE = "no path to the handle", "no free place of the base"  # reasons of refusals
 _DIFFERENCE = 0.025  # difference of the values at the ends of a path and of its reversal [m], [rad]
@@ -53,9 +54,9 @@ class BasePlacement:
         Coordinates (n,) of the robot: base and arm.
     approach, line
         Configuration (n,) before the hand is at the handle, and those (L, n) from there to the grasp.
-    values, path
-        Values (K,) of the object's coordinate [m], [rad], and configurations (K, n) of the robot there. They
-        end at the target, or where the arm or an obstacle ends them.
+    way, path
+        Values of the coordinates that move the handle, and configurations (K, n) of the robot there. They end
+        at the target, or where the arm or an obstacle ends them.
     retreat
         Configurations (L, n) with which the hand goes away from the handle at the end.
     samples
@@ -72,7 +73,7 @@ class BasePlacement:
     coordinates: tuple[Symbol, ...]
     approach: Array
     line: Array
-    values: Array
+    way: Way
     path: Array
     retreat: Array
     samples: int
@@ -82,6 +83,16 @@ class BasePlacement:
 
     def __bool__(self) -> bool:
         return self.grasp is not None
+
+    @property
+    def values(self) -> Array:
+        """Values (K,) of the object's coordinate along the path [m], [rad]."""
+        return self.way.values[:, -1]
+
+    def find_last_run(self) -> BasePlacement:
+        """Return the part of the path on which the object's coordinate moves alone."""
+        first = self.way.last_run
+        return replace(self, way=self.way.cut(first, len(self.way)), path=self.path[first:])
 
     def find_end_backwards(self, value: float, target: float) -> float | None:
         """Return the value to which the reversed path leads towards a target; None if it leads nowhere.
@@ -234,7 +245,6 @@ class PlacementSampler:
         return np.asarray(along + there - 40.0 * np.minimum(least, 0.1))
 
 
-_STEP = 0.05  # distance of neighbouring values of the object along its path [m], [rad]
 _RANDOM_STATES = 24  # number of random states in which links that are always near to each other are sought
 _OFFSET = 0.1  # largest change of each coordinate of the base in these states [m], [rad]
 _START_ITERATIONS = 30
@@ -332,7 +342,7 @@ class PlacementSearch:
         self,
         state: State,
         grasps: Sequence[Grasp],
-        target: float,
+        target: float | Way,
         *,
         accept: Callable[[BasePlacement], bool] = lambda placement: True,
         stays: bool = False,
@@ -357,7 +367,7 @@ class PlacementSearch:
         grasps
             Grasps that may be taken, the best first.
         target
-            Wanted value of the object's coordinate [m], [rad].
+            Wanted value of the object's coordinate [m], [rad], or the whole way of the handle.
         accept
             Function that says whether a placement is taken; the search goes on if not.
         stays
@@ -401,7 +411,7 @@ class PlacementSearch:
         self,
         state: State,
         earlier: BasePlacement,
-        target: float,
+        target: float | Way,
         accept: Callable[[BasePlacement], bool] = lambda placement: True,
     ) -> BasePlacement | None:
         """Return the path of an earlier placement backwards, from the object's value to a target.
@@ -438,7 +448,7 @@ class _Search:
         owner: PlacementSearch,
         state: State,
         grasps: Sequence[Grasp],
-        target: float,
+        target: float | Way,
         accept: Callable[[BasePlacement], bool],
         random: np.random.Generator,
         stands: bool = False,
@@ -448,16 +458,18 @@ class _Search:
         self.begin, self.tried, self.reached = perf_counter(), 0, False
         self.nowhere = not stands
         self.accept, self.refused = accept, 0
-        self.coordinate = grasps[0].handle.coordinate
-        start = float(state[self.coordinate])
-        self.values = np.linspace(start, target, max(2, math.ceil(abs(target - start) / _STEP) + 1))
-        self.last = len(self.values) - 1
-        self.least = max(1, math.ceil(_LEAST_SHARE * self.last))
+        coordinate = grasps[0].handle.coordinate
+        if not isinstance(target, Way):
+            target = Way.straight(coordinate, float(state[coordinate]), float(target))
+        self.way = way = target
+        self.last = len(way) - 1
+        # What is not past its latch when it is let go is latched again.
+        self.least = max(1, way.last_run + math.ceil(_LEAST_SHARE * (self.last - way.last_run)))
         handle = owner.model.fk(grasps[0].handle.frame)
-        self.handles = np.array([handle(state.updated({self.coordinate: v})) for v in self.values])
+        self.handles = np.array([handle(state.updated(way.at(k))) for k in range(len(way))])
         self.poses = np.array([grasp.pose for grasp in grasps])
         self.approaches = np.array([grasp.approach for grasp in grasps])
-        self.check = PathCheck(owner.contacts, owner.paths, state, grasps, self.values, self.handles)
+        self.check = PathCheck(owner.contacts, owner.paths, state, grasps, way, self.handles)
         self.free, self.reasons = self.check.free, self.check.reasons
         self.heap: list[tuple[int, float, int, CandidatePath]] = []
         self.number = count()
@@ -466,7 +478,7 @@ class _Search:
     def nothing(self) -> BasePlacement:
         none = np.zeros((0, len(self.owner.coordinates)))
         return BasePlacement(
-            None, self.owner.coordinates, none, none, self.values, none, none, self.tried, self.reasons,
+            None, self.owner.coordinates, none, none, self.way, none, none, self.tried, self.reasons,
             perf_counter() - self.begin, self.stands,
         )  # fmt: skip
 
@@ -498,7 +510,7 @@ class _Search:
         outside = handles[middle] @ self.approaches[choice]
         # A base that stands has to be free along the whole motion.
         stops = (middle, 0, self.last) if samples.stands(paths.ease) else (middle,)
-        states = [self.state.updated({self.coordinate: float(self.values[k])}) for k in stops]
+        states = [self.state.updated(self.way.at(k)) for k in stops]
         Q, base = samples.draw(self.random, states, hands, outside, _STARTS, self.owner.bases)
         if self.nowhere:
             places = samples.find_places(Q, base)[::_STARTS]
@@ -547,7 +559,8 @@ class _Search:
         paths, count = self.owner.paths, len(self.owner.moving)
         base = earlier.path[0, count:]
         order = np.argsort(earlier.values)
-        rows = [np.interp(self.values, earlier.values[order], q[order]) for q in earlier.path.T[:count]]
+        values = self.way.values[:, -1]
+        rows = [np.interp(values, earlier.values[order], q[order]) for q in earlier.path.T[:count]]
         hands = self.handles @ self.poses[0]
         path = self._correct(np.stack(rows, axis=1), base, hands)
         # The hand comes on the path on which it left, at the same place at the handle.
@@ -557,7 +570,7 @@ class _Search:
         if path is None or back is None:
             return None
         result = self._check(CandidatePath(0, base, back, path, self.last))
-        if result is None or len(result.values) <= self.last or not self.accept(result):
+        if result is None or len(result.way) <= self.last or not self.accept(result):
             return None
         return result
 
@@ -598,5 +611,5 @@ class _Search:
         full = [np.hstack([a, np.tile(base, (len(a), 1))]) for a in parts]
         return BasePlacement(
             self.grasps[candidate.choice], self.owner.coordinates, full[0][0], full[0],
-            self.values[: end + 1], full[1], full[2], self.tried, self.reasons, perf_counter() - self.begin,
+            self.way.cut(0, end + 1), full[1], full[2], self.tried, self.reasons, perf_counter() - self.begin,
         )  # fmt: skip

@@ -1,4 +1,7 @@
-"""Grasped opening: a hand takes a handle, moves the object to a value of its coordinate, and lets go."""
+"""Grasped opening: a hand takes a handle, moves the object to a value of its coordinate, and lets go.
+
+What has to be unlatched before is turned or pressed first, see :mod:`.contact_phases`.
+"""
 
 from __future__ import annotations
 
@@ -11,9 +14,6 @@ from kineverse._checks import as_count, as_positive
 from kineverse.errors import InvalidValueError
 from kineverse.grasping import Gripper, Handle, find_handle
 from kineverse.manipulation.outcome import Outcome, SkillError
-from kineverse.manipulation.pushing.base_placement import find_push_start
-from kineverse.manipulation.pushing.push_controller import Pushing
-from kineverse.manipulation.pushing.push_skill import push
 from kineverse.manipulation.session import Session
 from kineverse.manipulation.skill_run import (
     SkillRun,
@@ -23,24 +23,21 @@ from kineverse.manipulation.skill_run import (
     explain_fixed,
     find_object_coordinate,
 )
-from kineverse.state import State
 from kineverse.symbols import Symbol
 
 from .approach_planner import Approach, Opener
 from .base_placement import BasePlacement
+from .contact_phases import ContactPhase, PhasePlanner, Way
 from .hand_motion import HandMotion, SlipError, move_held
+from .planned_push import LEAST_PUSH, PlannedPush, press
 
 _SLANT = math.radians(50.0)  # largest slant of grasps where those from across the handle lead nowhere [rad]
 _PROOF = 200  # largest number of sampled bases that are to prove that an object is too high
-_MOST_GRASPS, _MOST_PUSHES = 4, 3
+_MOST_GRASPS, _MOST_PUSHES, _MOST_PHASES = 4, 3, 8
 _LATE = 1.0  # time before the end at which it counts as up [s]
 _MOST_SLIPS, _LEAST_PROGRESS = 2, 0.1
 """Number of slips from which on a grasp has to take an object further, by a share of the rest."""
 _HEIGHTS = 12  # number of values at which the height of an object is compared with that of the hand
-_PUSH_STARTS = 960  # most sampled starts; a limit of time would let results depend on other processes
-_LEAST_PUSH = 0.2  # least share of the rest that a push is for
-_LONGER, _AFTER = 1.5, 2.0  # share of the time in the roll-out that a partial push lasts, and rest [s]
-_PLANNING, _PUSHING = 1.0, 10.0  # largest time to plan the path to a push, and least time for it [s]
 
 
 def open_object(
@@ -64,6 +61,10 @@ def open_object(
     place before the arm moves; one that cannot turn on the spot stays where it is. A hand that is at the
     handle from the start, as after a skill that was broken off, lets go first. Nothing is moved where
     something is in the way of the object, see :func:`.find_obstacle`.
+
+    Where other parts hold the object, it is planned how they unlatch it. Those that move its handle, such as
+    a lever, are moved in the same grasp, and are let back as soon as it is free; others are moved by handles
+    of their own, or pressed. That is planned anew before each grasp, without the parts that did not move.
 
     Parameters
     ----------
@@ -89,7 +90,8 @@ def open_object(
     -------
     Outcome
         With ``measures``: ``target``, ``tolerance``, ``placements``, ``grasps`` and ``slips`` (numbers of
-        sampled bases, of grasps, and of those that the handle slipped out of), ``pushed``, and ``failure``:
+        sampled bases, of grasps, and of those that the handle slipped out of), ``pushed``, ``unlatched`` if
+        something else had to move (the coordinates, as they did), and ``failure``:
         ``"collision"``, ``"reach"``, ``"time"`` or ``"other"`` if it was not done; ``free``, the value up to
         which the path is free, if something is in the way.
 
@@ -128,7 +130,9 @@ class OpeningRun(SkillRun):
     ) -> None:
         super().__init__(session, handle.coordinate, seconds)
         self.opener, self.handle, self.gripper = opener, handle, opener.gripper
-        self.motion = HandMotion(self, opener, handle, seed)
+        self.phases = PhasePlanner(self.model, self.robot, handle)
+        self.motion = HandMotion(self, opener, handle, seed, self.phases.carriers)
+        self._stuck: dict[Symbol, str] = {}  # what did not move when it should have, and why
         self._wanted = target, tolerance
         self.target = self.tolerance = math.nan
         self._samples, self._seed = placements, seed
@@ -157,15 +161,20 @@ class OpeningRun(SkillRun):
         """Move the object to the target, and return that it is there, or raise SkillError."""
         self.motion.look()
         self._choose_target()
+        phase = self._find_phase()
         if self.motion.is_at_handle:
             self.motion.let_go()
         self._check_start()
-        self._check_height()
+        if phase.handle is self.handle:
+            self._check_height(phase.way)
         failure = self._move_grasped()
         for attempt in range(_MOST_PUSHES):
             before = self.rest
             if before <= self.tolerance:
                 break
+            phase = self._find_phase()
+            if phase.handle is not self.handle or phase.way.keys:
+                raise failure  # no push opens a latch
             self._push(failure, attempt)
             if self.tolerance < self.rest < (1.0 - _LEAST_PROGRESS) * before:
                 failure = self._move_grasped()
@@ -184,12 +193,21 @@ class OpeningRun(SkillRun):
         model, coordinate, state = self.model, self.coordinate, self.session.state
         target, tolerance = self._wanted
         fixed = explain_fixed(model, coordinate, state)
-        if fixed and target != self.value:
+        if fixed and target != self.value and not self.phases.has_keys:
             raise SkillError("other", fixed)
         self.target = choose_target(model, coordinate, state, target)
         self.tolerance = choose_tolerance(model, coordinate, state, self.target, tolerance)
         self.measures |= {"target": self.target, "tolerance": self.tolerance}
         self.check_way(self.target)
+
+    def _find_phase(self) -> ContactPhase:
+        """Return the next contact on the way to the target, or raise SkillError if it cannot be unlatched."""
+        state = self.session.state
+        try:
+            return self.phases.find_next(state, self.target, self._stuck, self.session.deviation)
+        except SkillError as error:
+            fixed = explain_fixed(self.model, self.coordinate, state)
+            raise SkillError("other", " ".join([*self._stuck.values(), fixed, str(error)]).strip()) from None
 
     def _check_start(self) -> None:
         """Raise SkillError if the robot touches something before anything is done."""
@@ -201,12 +219,12 @@ class OpeningRun(SkillRun):
             kind = "reach" if search.standing else "collision"
             raise SkillError(kind, f"The robot begins in contact: '{pair.a}' at '{pair.b}'.")
 
-    def _check_height(self) -> None:
+    def _check_height(self, way: Way) -> None:
         """Raise SkillError if the hand is too low to touch the object on all its way, by grasp or by push."""
         last = self.target - math.copysign(min(self.tolerance, self.rest), self.target - self.value)
         values = np.linspace(self.value, last, _HEIGHTS)
         why = self.opener.search.find_too_high(self.session.state, self.coordinate, values)
-        result = self._search(min(self._samples, _PROOF)) if why else None
+        result = self._search(way, min(self._samples, _PROOF)) if why else None
         if result is not None and not (result and result.values[-1] == self.target):
             raise SkillError("reach", f"{why} None of {result.samples} bases leads to {self.target:.3f}.")
 
@@ -240,7 +258,8 @@ class OpeningRun(SkillRun):
         try:
             if self.motion.close(placement.grasp):
                 move_held(self.motion, placement, self.tolerance)
-                self.session.made.append(placement)
+                self._note_unlatched(*placement.way.keys)
+                self.session.made.append(placement.find_last_run())
         except SlipError as slip:
             self.slips.append(str(slip))
         except SkillError as error:
@@ -255,7 +274,9 @@ class OpeningRun(SkillRun):
             if not late or self.rest > self.tolerance:
                 raise
         if stall is not None and self.rest > (1.0 - _LEAST_PROGRESS) * before:
-            raise stall
+            phase, way = self._find_phase(), placement.way
+            if phase.handle is self.handle and phase.way.keys == way.keys:
+                raise stall  # else it was believed to be unlatched, and is not
         self._check_progress()
 
     def _check_progress(self) -> None:
@@ -271,11 +292,12 @@ class OpeningRun(SkillRun):
 
     def _place(self) -> BasePlacement:
         """Return a placement that leads as far as possible, and plan the path to the handle."""
-        back = self._retrace(whole=True)
+        way = self._unlatch()
+        back = None if way.keys else self._retrace(whole=True)
         if back is not None:
             return back
         try:
-            result = self._search(self._samples)
+            result = self._search(way, self._samples)
             if result:
                 return result
             failure = self.motion.explain(result)
@@ -283,10 +305,54 @@ class OpeningRun(SkillRun):
             if self.session.fault:
                 raise
             failure = error
-        back = self._retrace(whole=False)
+        back = None if way.keys else self._retrace(whole=False)
         if back is None:
             raise failure
         return back
+
+    def _unlatch(self) -> Way:
+        """Move what has to move before the object is taken, and return the way of its handle then."""
+        for _ in range(_MOST_PHASES):
+            phase = self._find_phase()
+            if phase.handle is self.handle:
+                return phase.way
+            try:
+                if phase.handle is None:
+                    press(self.motion, phase, self._seed)
+                else:
+                    self._move_other(phase, phase.handle)
+            except SkillError as error:
+                if self.session.fault or self.left < 0.0:
+                    raise
+                self._stuck[phase.coordinate] = str(error)
+            else:
+                self._note_unlatched(phase.coordinate)
+            self.motion.look()
+        raise SkillError(
+            "other", f"'{self.coordinate}' was unlatched {_MOST_PHASES} times, and is latched again."
+        )
+
+    def _note_unlatched(self, *keys: Symbol) -> None:
+        if keys:
+            self.measures["unlatched"] = [*self.measures.get("unlatched", ()), *map(str, keys)]
+
+    def _move_other(self, phase: ContactPhase, handle: Handle) -> None:
+        """Move another part by its handle as a phase says, or raise SkillError."""
+        run = OpeningRun(
+            self.session,
+            self.opener,
+            handle,
+            phase.target,
+            phase.tolerance,
+            self.left,
+            self._samples,
+            self._seed,
+        )
+        outcome = run.perform(run.open)
+        for name in ("placements", "grasps"):
+            self.measures[name] += outcome.measures[name]
+        if not outcome:
+            raise SkillError(outcome.measures["failure"], outcome.reason)
 
     def _retrace(self, *, whole: bool) -> BasePlacement | None:
         """Return an earlier motion, reversed, that leads on from here or to the target; None without any."""
@@ -301,22 +367,23 @@ class OpeningRun(SkillRun):
                     or abs(end - here) < _LEAST_PROGRESS * self.rest
                 ):
                     continue
-                result = self.opener.search.retrace(session.state, earlier, end, self.motion.plan)
+                way = self.phases.find_straight(session.state, end)
+                result = self.opener.search.retrace(session.state, earlier, way, self.motion.plan)
                 if result is not None:
                     self._reversible.remove(earlier)
                     return result
         self.motion.planned = Approach()
         return None
 
-    def _search(self, samples: int) -> BasePlacement:
+    def _search(self, way: Way, samples: int) -> BasePlacement:
         """Search a placement, with hands that come from along the bar where no other one leads to it."""
-        result = self._search_with(samples, 0.0)
+        result = self._search_with(way, samples, 0.0)
         if not result and not self.handle.is_knob:
             with contextlib.suppress(SkillError):  # there may be no room for such a hand
-                result = self._search_with(samples, _SLANT) or result
+                result = self._search_with(way, samples, _SLANT) or result
         return result
 
-    def _search_with(self, samples: int, slant: float) -> BasePlacement:
+    def _search_with(self, way: Way, samples: int, slant: float) -> BasePlacement:
         """Search a placement among the most sampled bases that are allowed, and count them."""
         session, opener = self.session, self.opener
         session.phase = "place"
@@ -329,7 +396,7 @@ class OpeningRun(SkillRun):
             result = opener.search.find(
                 session.state,
                 grasps,
-                self.target,
+                way,
                 accept=self.motion.plan,
                 stays=bool(opener.approaches.explain_standing(session.state)),
                 samples=samples,
@@ -347,22 +414,13 @@ class OpeningRun(SkillRun):
         if self.opener.approaches.explain_standing(session.state):
             raise failure  # starts of pushes are elsewhere
         try:
-            pushing, seconds = self._find_push(self._seed + attempt)
+            planned = PlannedPush(self.motion, self.coordinate, self.target, self._seed + attempt)
             begun = True
-            self.motion.drive()
-            self.motion.follow_planned()
-            outcome = push(
-                session,
-                self.coordinate,
-                target=self.target,
-                tolerance=self.tolerance,
-                seconds=min(seconds, self.left),
-                pushing=pushing,
-                plan=False,
-                retreat=True,
-            )
-            if session.fault or (not outcome and self.rest > (1.0 - _LEAST_PUSH / 2) * before):
-                raise SkillError(outcome.measures["failure"], outcome.reason)
+            try:
+                planned.make(self.tolerance)
+            except SkillError:
+                if session.fault or self.rest > (1.0 - LEAST_PUSH / 2) * before:
+                    raise
         except SkillError as error:
             if session.fault:
                 raise
@@ -372,45 +430,3 @@ class OpeningRun(SkillRun):
         finally:
             if self.pushed_from is None and begun:
                 self.pushed_from = value
-
-    def _find_push(self, seed: int) -> tuple[Pushing, float]:
-        """Find a push that goes through, or far, with a path to its start; and how long it lasts [s]."""
-        session = self.session
-        session.phase = "place"
-        with session.search("starts of a push, as no grasp leads on"):
-            state = session.state
-            try:
-                pushing = Pushing(
-                    self.model,
-                    self.robot,
-                    self.coordinate,
-                    self.gripper.bodies,
-                    state,
-                    target=self.target,
-                    dt=session.dt,
-                    fixed=self.gripper.joints,
-                )
-                result = find_push_start(
-                    pushing,
-                    state,
-                    samples=_PUSH_STARTS,
-                    seconds=math.inf,
-                    seed=seed,
-                    least=_LEAST_PUSH,
-                    accept=self._plan_push,
-                    report=session.report_search,
-                )
-            except InvalidValueError as error:
-                raise SkillError("reach", f"It cannot be pushed: {error}") from error
-        if result.state is None:
-            raise SkillError(result.failure, f"Nor does a push: {result.why}")
-        return pushing, math.inf if result.whole else _LONGER * result.steps * session.dt + _AFTER
-
-    def _plan_push(self, start: State) -> str:
-        """Plan the path to the start of a push, and return why there is none."""
-        self.motion.planned = planned = self.opener.approaches.plan(
-            self.session.state, start, seconds=_PLANNING
-        )
-        if planned.trajectory is None:
-            return "no path to the start"
-        return "far away" if planned.trajectory.duration > self.left - _PUSHING else ""

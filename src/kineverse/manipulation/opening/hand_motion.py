@@ -58,28 +58,41 @@ Targets = TypeVar("Targets")
 
 
 class HandMotion:
-    """Motions of the hand of a robot at a handle, and the path to it that was planned last."""
+    """Motions of the hand of a robot at a handle, and the path to it that was planned last.
 
-    def __init__(self, run: SkillRun, opener: Opener, handle: Handle, seed: int = 0) -> None:
+    ``carriers`` are coordinates that move the handle, besides its own.
+    """
+
+    def __init__(
+        self,
+        run: SkillRun,
+        opener: Opener,
+        handle: Handle,
+        seed: int = 0,
+        carriers: tuple[Symbol, ...] = (),
+    ) -> None:
         self.run, self.session, self.handle, self.seed = run, run.session, handle, seed
         self.planned = Approach()
         self.gripper, self.search, self.approaches = opener.gripper, opener.search, opener.approaches
         self.controllers, self.model = opener.controllers, opener.search.model
         self.turns: Array = np.zeros(len(self.search.moving))
         self.hand, self.bar = self.model.fk(self.gripper.hand), self.model.fk(handle.frame)
-        self._slope = self.bar[:3, 3].partial([handle.coordinate])
-        limits = {s: self.model.limits(s) for s in (*self.search.moving, handle.coordinate)}
+        self._carriers = *carriers, handle.coordinate
+        self._slopes = self.bar[:3, 3].partial(self._carriers)
+        limits = {s: self.model.limits(s) for s in (*self.search.moving, *self._carriers)}
         self._limits = {s: (float(a), float(b)) for s, (a, b) in limits.items()}
         self.fingers: dict[Symbol, float] = {}  # where they stood around the bar
 
     @property
     def deviation(self) -> float:
         """Standard deviation of the position of the handle [m]; 0 if it is known exactly."""
-        session, coordinate = self.session, self.handle.coordinate
-        if not (deviation := session.deviation(coordinate)):
+        session = self.session
+        deviations = np.array([session.deviation(s) for s in self._carriers])
+        if not deviations.any():
             return 0.0
-        slope = self._slope(session.state)
-        return deviation * float(np.linalg.norm(slope))
+        slopes = self._slopes(session.state).reshape(3, -1)
+        moving = (slopes != 0.0) & (deviations > 0.0)
+        return float(np.linalg.norm(np.multiply(slopes, deviations, out=np.zeros_like(slopes), where=moving)))
 
     def look(self) -> None:
         """Stand until the handle is known well, or raise SkillError if it is not seen."""
@@ -146,13 +159,13 @@ class HandMotion:
         self.move_fingers(self.gripper.opened)
         self.count_turns(placement.line[0])
         # A hand that takes a path back comes from where it left, and not on the line of the grasp.
-        start = self._place_hand(placement, placement.line[0], placement.values[0])
+        start = self._place_hand(placement, placement.line[0], 0)
         self.follow_line(start, placement.grasp.pose, self.rows(placement.line))
 
-    def _place_hand(self, placement: BasePlacement, row: Array, value: float) -> Array:
-        """Return the pose bar_T_hand at a configuration (n,) of a placement and a value of the object."""
+    def _place_hand(self, placement: BasePlacement, row: Array, index: int) -> Array:
+        """Return the pose bar_T_hand at a configuration (n,) of a placement and a place on its way."""
         wanted = dict(zip(placement.coordinates, row.tolist(), strict=True))
-        state = self.session.state.updated({**wanted, self.handle.coordinate: float(value)})
+        state = self.session.state.updated({**wanted, **placement.way.at(index)})
         pose: Array = inverse(self.bar(state)) @ self.hand(state)
         return pose
 
@@ -271,11 +284,11 @@ class HandMotion:
         world_T_bar, world_T_hand = self.bar(state), self.hand(state)
         pose = inverse(world_T_bar) @ world_T_hand
         self.session.phase = "retract"
-        if abs(state[self.handle.coordinate] - placement.values[-1]) > _ARRIVED:
+        if max(abs(state[s] - v) for s, v in placement.way.at(-1).items()) > _ARRIVED:
             # The retreat of the placement was checked for an object that has arrived.
             self._back_off(grasp)
             return
-        gone = self._place_hand(placement, placement.retreat[-1], placement.values[-1])
+        gone = self._place_hand(placement, placement.retreat[-1], -1)
         away = pose.copy()
         away[:3, 3] += gone[:3, 3] - grasp.pose[:3, 3]
         self.follow_line(pose, away, self.rows(placement.retreat))
@@ -432,66 +445,75 @@ _STEPS_AT_TARGET = 10  # number of steps for which an estimate is at the target 
 def move_held(motion: HandMotion, placement: BasePlacement, tolerance: float) -> None:
     """Move a held object along the path of a placement."""
     bar, hand = motion.bar, motion.hand
-    session, coordinate, grasp = motion.session, motion.handle.coordinate, placement.grasp
+    session, way, grasp = motion.session, placement.way, placement.grasp
     assert grasp is not None
+    coordinates, coordinate, target = way.coordinates, way.coordinates[-1], way.target
     session.phase = "move"
     slip = SlipDetector(motion)
     held = slip.bar_T_hand
-    target = float(placement.values[-1])
     moving = motion.search.moving
     rows = motion.rows(placement.path)
-    values = placement.values
 
     def make() -> tuple[Controller, tuple[Target, Target, Target, Target]]:
         # The initial values are of no run: a controller with others would be compiled for these alone.
-        grasped, wanted = Target("grasp/pose", np.eye(4)), Target("opening/object", np.zeros(1))
+        grasped, wanted = (
+            Target("grasp/pose", np.eye(4)),
+            Target("opening/object", np.zeros(len(coordinates))),
+        )
         posture, arm_speeds, goals = motion.posture()
         hold = Hold(same_pose(bar @ grasped.expression, hand), gain=FOLLOWING, name="grasp")
-        goal = Goal(coordinate, wanted.expression[0], gain=FOLLOWING, name="object")
-        result = motion.holding_controller(motion.model, [hold, goal, *goals])
+        moved = [
+            Goal(s, wanted.expression[k], gain=FOLLOWING, name="object" if s == coordinate else f"object {s}")
+            for k, s in enumerate(coordinates)
+        ]
+        result = motion.holding_controller(motion.model, [hold, *moved, *goals])
         return result, (grasped, wanted, posture, arm_speeds)
 
-    key = "held", motion.handle.frame, coordinate
+    key = "held", motion.handle.frame, coordinates
     controller, (grasped, wanted, posture, arm_speeds) = motion.find_controller(key, make)
-    share, length, pace = 0.0, abs(target - values[0]), Pace(session, _LATE)
+    share, pace = 0.0, Pace(session, _LATE)
+    length = float(np.abs(np.diff(way.values, axis=0)).max(axis=1).sum())
     best, since = 0.0, session.time
     controller.set(grasped, held)
     controller.set(arm_speeds, np.zeros(len(moving)))  # the path waits for the arm
-    places = np.linspace(values[0], target, len(values)).tolist()
-    motion.refer([bar(session.state.updated({coordinate: v})) @ held for v in places])
+    motion.refer([bar(session.state.updated(way.at(k))) @ held for k in range(len(way))])
     within, enough = 0, _STEPS_AT_TARGET if session.deviation(coordinate) else 1
     while True:
         rest = abs(session.state[coordinate] - target)
-        within = within + 1 if rest <= tolerance / 4 else 0
+        there = rest <= tolerance / 4 and (share == 1.0 or len(coordinates) == 1)
+        within = within + 1 if there else 0
         if within >= enough:
             return
         with session.timed("open"):
             state = motion.state
             reference = row_at(rows, share)
-            value = values[0] + share * (target - values[0])
+            place = row_at(way.values, share)
             controller.set(posture, reference)
-            controller.set(wanted, np.array([value]))
+            controller.set(wanted, place)
             command = controller.step(state)
             # The reference waits for the slowest joint.
             arm = np.abs(reference - state.vector(moving)).max(initial=0.0)
-            late = max(float(arm), abs(value - state[coordinate]))
+            off = np.abs(place - state.vector(coordinates))
+            late = max(float(arm), float(off.max()))
         motion.refer_to(share)
         motion.run.act(command.speeds, command)
+        passed = share * length
         share = min(1.0, share + pace.advance(late) * _SPEED / length)
         slip.check()
-        done = abs(session.state[coordinate] - values[0])
+        done = passed - float(np.abs(place - session.state.vector(coordinates)).max())
         if done > best + _STALLED:
             best, since = done, session.time
         resting = session.time - since
         if share == 1.0 and rest < 0.75 * tolerance and resting > _RESTING:
             return
-        planned = abs(float(command.speeds.get(coordinate.derivative(), np.inf)))
+        planned = max(abs(float(command.speeds.get(s.derivative(), np.inf))) for s in coordinates)
         held_fast = best == 0.0 and share < 1.0 and planned < _STANDING
         if resting > (_LOCKED if held_fast else _PATIENCE):
             stops = ", ".join(command.active[:3]) or "nothing that the controller knows; it may be locked"
+            stuck = coordinates[int(np.argmax(off))]
             raise SkillError(
                 "collision" if "contact" in stops else "other",
-                f"'{coordinate}' does not move on from {session.state[coordinate]:.3f}. In the way: {stops}.",
+                f"'{stuck}' does not move on from {session.state[stuck]:.3f}. In the way: {stops}.",
             )
 
 

@@ -97,6 +97,7 @@ def push(
     tolerance: float | None = None,
     plan: bool = True,
     retreat: bool = False,
+    returns: bool = False,
     pushing: Pushing | None = None,
 ) -> Outcome:
     """Push an articulated object to a value of its coordinate.
@@ -125,6 +126,8 @@ def push(
         Whether approaches are planned where the path of the controller is blocked.
     retreat
         Whether the pusher is taken away from the object at the end.
+    returns
+        Whether the object may move back when the pusher is taken away, as a button on a spring does.
     pushing
         A controller that was built before, in place of ``target`` and ``bodies``.
 
@@ -147,7 +150,7 @@ def push(
     elif wanted is None:
         wanted = find_shut_value(session.model, coordinate)
     run = PushRun(session, coordinate, seconds, wanted, plan)
-    return run.perform(partial(run.push, bodies, pushing, tolerance, retreat))
+    return run.perform(partial(run.push, bodies, pushing, tolerance, retreat, returns))
 
 
 class _End:
@@ -201,6 +204,7 @@ class PushRun(SkillRun):
         pushing: Pushing | None,
         tolerance: float | None,
         retreat: bool,
+        returns: bool,
     ) -> str:
         """Push until the object is at its target, and return why it is, or raise SkillError."""
         session, model, coordinate, target = self.session, self.model, self.coordinate, self._target
@@ -224,6 +228,7 @@ class PushRun(SkillRun):
         self._pushing = pushing
         try:
             failure = self._push_on()
+            value = self.value
             if retreat:
                 self._retreat()
         finally:
@@ -234,7 +239,8 @@ class PushRun(SkillRun):
                 "jammed": pushing.choice.jammed,
                 "planned": self._approaches,
             }
-        value, rest = self.value, abs(self.value - target)
+        value = value if returns else self.value
+        rest = abs(value - target)
         allowed = 0.0 if failure is not None else _SIGMAS * session.deviation(coordinate)
         if rest < tolerance + allowed:
             return f"'{coordinate}' is at {value:.3g}"

@@ -1,0 +1,232 @@
+"""Faults of live systems: processes are killed or frozen while a robot moves; it stops and finishes later."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import suppress
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+import kineverse as kv
+from kineverse.errors import OfflineError
+from kineverse.live.streams import (
+    ACTIVITY,
+    ROBOT,
+    SUPERVISOR,
+    TRUTH,
+    ActivityNote,
+    RobotNote,
+    SupervisorNote,
+    decode,
+    read_note,
+)
+
+from .processes import folder, wait_until
+
+KITCHEN, DRAWER, HANDLE = "kitchen", "kitchen/sink_left_upper_drawer", "kitchen/sink_left_upper_drawer_handle"
+ZERO, REST, HELD = 0.05, 0.15, 0.01
+"""Longest times from a fault until commanded speeds are zero, and the robot rests [s]; and the longest way of
+a handle that is held [m]."""
+SLOW = 0.05  # speed of a joint below which a robot rests [m/s], [rad/s]
+FROZEN = 1.0  # time for which a process is frozen [s]
+AFTER = 0.5  # time for which the robot is watched after a fault [s]
+STARTING, FINISHING = 120.0, 240.0  # longest times until a phase, and until all is done [s]
+HOLDING = "move"  # phase in which the robot holds the object and moves it
+
+
+class Fault(NamedTuple):
+    """Signal to a process in a phase of a skill."""
+
+    process: str
+    signal: str  # KILL or STOP
+    phase: str
+
+    def __str__(self) -> str:
+        return f"{self.process} {self.signal} in {self.phase}"
+
+
+FAULTS = (
+    Fault("behave", "KILL", HOLDING),
+    Fault("track", "STOP", HOLDING),
+    Fault("world", "STOP", HOLDING),
+    Fault("behave", "KILL", "approach"),
+    Fault("behave", "STOP", HOLDING),
+    Fault("track", "KILL", HOLDING),
+    Fault("behave", "STOP", "approach"),
+    Fault("track", "KILL", "approach"),
+    Fault("track", "STOP", "approach"),
+    Fault("behave", "KILL", "close"),
+    Fault("track", "KILL", "retract"),
+    Fault("serve", "KILL", HOLDING),
+)
+"""The runs; the first three are the short form."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument("--runs", type=int, default=len(FAULTS), help=f"how many of the {len(FAULTS)} runs")
+    parser.add_argument("--robot", default="hsr", help="a robot that ships (hsr)")
+    parser.add_argument("--most", type=float, default=1.0, help="times the bars that are held (1)")
+
+
+def run(arguments: argparse.Namespace) -> Iterator[str]:
+    """Try the runs, and yield a line for each."""
+    for k, fault in enumerate(FAULTS[: arguments.runs]):
+        found = try_fault(fault, arguments.robot, arguments.most)
+        yield f"{k + 1} {fault}: " + ", ".join(f"{name} {value}" for name, value in found.items())
+
+
+class Watch(threading.Thread):
+    """Thread that keeps what a live system publishes."""
+
+    def __init__(self, model: kv.exchange.LiveModel, what: str, handle: str) -> None:
+        super().__init__(daemon=True)
+        self.reader = model.exchange.reader()
+        self._place = kv.compile([model.fk(handle)[:3, 3]])
+        self._what, self.over = what, False
+        self.robot: list[tuple[float, float, np.ndarray]] = []  # stamp, commanded speed, encoders
+        self.truth: list[tuple[float, float, np.ndarray]] = []  # stamp, value, place of the handle
+        self.phase = ""
+
+    def run(self) -> None:
+        """Keep each reading."""
+        while not self.over:
+            self.reader.wait(0.1)
+            newest = self.reader.newest(ROBOT)
+            note = None if newest is None else decode(newest.note, RobotNote)
+            if newest is not None and note is not None and _is_new(self.robot, newest.stamp):
+                self.robot.append((newest.stamp, note.commanded, newest.values))
+            truth = self.reader.newest(TRUTH)
+            if truth is not None and _is_new(self.truth, truth.stamp):
+                values = dict(zip(truth.names, truth.values.tolist(), strict=True))
+                place = self._place([values[str(s)] for s in self._place.inputs])
+                self.truth.append((truth.stamp, values[self._what], np.array(place).ravel()))
+            doing = read_note(self.reader, ACTIVITY, ActivityNote)
+            self.phase = self.phase if doing is None else doing.phase
+
+    @property
+    def speed(self) -> float:
+        """Commanded speed of the last reading."""
+        return self.robot[-1][1] if self.robot else 0.0
+
+    def pids(self) -> dict[str, int]:
+        """Return the processes that the supervisor has."""
+        note = read_note(self.reader, SUPERVISOR, SupervisorNote)
+        return {} if note is None else {row.name: row.pid for row in note.rows if row.pid}
+
+
+def _is_new(kept: list[tuple[float, float, np.ndarray]], stamp: float) -> bool:
+    return not kept or stamp > kept[-1][0]
+
+
+def try_fault(fault: Fault, robot: str, most: float = 1.0) -> dict[str, Any]:
+    """Start a live system, send a signal to a process, and return what was measured."""
+    with folder() as path:
+        output = Path(path, "output")
+        words = [
+            KITCHEN,
+            "--robot",
+            robot,
+            "--world",
+            "mujoco",
+            "--do",
+            "tour",
+            "--what",
+            DRAWER,
+            "--headless",
+        ]
+        command = [sys.executable, "-m", "kineverse", "live", *words, "--name", "fault", "--json"]
+        with output.open("w", encoding="utf-8") as out:
+            system = subprocess.Popen(command, stdout=out, stderr=subprocess.STDOUT, cwd=path)
+        try:
+            return _measure(fault, system, output, most)
+        finally:
+            if system.poll() is None:
+                system.send_signal(signal.SIGINT)
+                with suppress(subprocess.TimeoutExpired):
+                    system.wait(20.0)
+            system.kill()
+            system.wait()
+
+
+def _measure(fault: Fault, system: subprocess.Popen[bytes], output: Path, most: float) -> dict[str, Any]:
+    watch = Watch(_connect(system, output), DRAWER, HANDLE)
+    watch.start()
+    moves = fault.phase in (HOLDING, "approach", "retract")
+
+    def is_there() -> bool:
+        assert system.poll() is None, f"it ended: {output.read_text('utf-8')[-2000:]}"
+        return watch.phase == fault.phase and (not moves or watch.speed > 2 * SLOW)
+
+    wait_until(is_there, STARTING, f"the phase '{fault.phase}'")
+    if moves:
+        time.sleep(0.5)  # at its speed
+    pid = watch.pids()[fault.process]
+    at = time.time()
+    os.kill(pid, getattr(signal, f"SIG{fault.signal}"))
+    if fault.signal == "STOP":
+        time.sleep(FROZEN)
+        os.kill(pid, signal.SIGCONT)
+    else:
+        time.sleep(AFTER)
+    found = _find_stop(watch, at)
+    stops = fault.process in ("behave", "track") and moves
+    if stops:
+        assert found["zero"] <= most * ZERO, f"{fault}: commanded speeds are zero after {found['zero']:.3f} s"
+        if fault.phase == HOLDING:
+            assert found["way"] <= most * HELD, f"{fault}: the handle moved {1e3 * found['way']:.1f} mm"
+        else:
+            assert found["rest"] <= most * REST, f"{fault}: the robot rests after {found['rest']:.3f} s"
+    try:
+        system.wait(FINISHING)
+    except subprocess.TimeoutExpired:
+        raise AssertionError(f"{fault}: not finished. {output.read_text('utf-8')[-2000:]}") from None
+    watch.over = True
+    text = output.read_text("utf-8")
+    assert system.returncode == 0, f"{fault}: not done. {text[-2000:]}"
+    answer = json.loads(text[text.index("{") :])
+    restarts = answer["restarts"]
+    assert fault.signal == "STOP" or restarts, f"{fault}: nothing was started again"
+    milliseconds = {name: f"{1e3 * found[name]:.0f} ms" for name in ("zero", "rest") if stops}
+    return {**milliseconds, "way": f"{1e3 * found['way']:.1f} mm", "restarts": restarts, "done": True}
+
+
+def _connect(system: subprocess.Popen[bytes], output: Path) -> kv.exchange.LiveModel:
+    model: list[kv.exchange.LiveModel] = []
+
+    def connects() -> bool:
+        assert system.poll() is None, f"it ended: {output.read_text('utf-8')[-2000:]}"
+        with suppress(OfflineError):
+            model.append(kv.load("live:fault"))
+        return bool(model)
+
+    wait_until(connects, STARTING, "a model server")
+    return model[0]
+
+
+def _find_stop(watch: Watch, at: float) -> dict[str, float]:
+    """Return when commands were zero and the robot rested [s], and how far the handle went [m]."""
+    robot = [one for one in watch.robot if at - 0.1 < one[0] < at + AFTER]
+    truth = [one for one in watch.truth if at - 0.1 < one[0] < at + AFTER]
+    zero = next((stamp for stamp, commanded, _ in robot if stamp > at and not commanded), math.inf)
+    moving = [
+        b[0] for a, b in pairwise(robot) if b[0] > a[0] and np.abs(b[2] - a[2]).max() / (b[0] - a[0]) > SLOW
+    ]
+    before = [one for one in truth if one[0] <= at]
+    after = [one for one in truth if one[0] > at]
+    way = (
+        max((float(np.linalg.norm(one[2] - before[-1][2])) for one in after), default=0.0) if before else 0.0
+    )
+    return {"zero": zero - at, "rest": max(moving, default=at) - at, "way": way}
