@@ -31,6 +31,7 @@ NOISE = "3mm+3mm/m,0.5deg,30Hz"  # noise of the observed poses, unless another o
 WORLDS = ("kinematic", "mujoco")
 STEP = 1e-3  # time step of physics [s]
 _TIME = re.compile(r"\s*([0-9]*\.?[0-9]+)\s*(ms|s|)\s*")
+_WITHOUT_ROUNDS = ("closer", "unknown")  # behaviours
 _SWITCHING = 5e-4  # time for which another thread may hold up a process in real time [s]
 
 _ABOUT = """
@@ -83,9 +84,9 @@ def add_rounds_option(parser: argparse.ArgumentParser) -> None:
 
 def check_task(do: str, far: float, rounds: int) -> None:
     """Check ``--far`` and ``--rounds`` of a behaviour."""
-    if rounds < 1 or (rounds > 1 and do == "closer"):
+    if rounds < 1 or (rounds > 1 and do in _WITHOUT_ROUNDS):
         raise InvalidValueError(
-            f"--rounds {rounds}: a closer has no rounds; --do tour has."
+            f"--rounds {rounds}: '{do}' has no rounds; --do tour has."
             if rounds > 1
             else f"--rounds is a number from 1 on, not {rounds}."
         )
@@ -341,7 +342,7 @@ def _run_behave(arguments: argparse.Namespace) -> int:
                 tell(note)
                 lines.print(note)
 
-            rounds = {} if arguments.do == "closer" else {"rounds": arguments.rounds}
+            rounds = {} if arguments.do in _WITHOUT_ROUNDS else {"rounds": arguments.rounds}
             return BEHAVIOURS[arguments.do](
                 sessions,
                 **rounds,

@@ -127,6 +127,17 @@ class _Part:
     written: Fit | None = None
     wrote: float = -math.inf
 
+    @property
+    def distance(self) -> float:
+        """Motion of the part [m], its turn about an axis that may be anywhere included."""
+        return max(self.way, _ARM * self.turn)
+
+    @property
+    def is_of_interest(self) -> bool:
+        """Whether something can be said of the part, or it was asked for."""
+        has_moved = self.learning.poses >= _FEWEST and self.distance > _MOVED
+        return self.is_named or self.written is not None or has_moved
+
 
 @dataclass(eq=False)
 class _KnownJoint:
@@ -257,11 +268,10 @@ class ModelEstimator:
         ):
             pose = self._relate(part.parent) @ tracks.smoothed(part.frame)
             part.way, part.turn = measure_way(part.start, pose, np.zeros(3))
-        distance = max(part.way, _ARM * part.turn)
         if part.learning.poses < _FEWEST or now - part.fitted < _PERIOD:
             return
         part.fitted = now
-        if not part.learning.update(distance, part.turn, now) or part.start is None:
+        if not part.learning.update(part.distance, part.turn, now) or part.start is None:
             return
         learned = part.learning.learned
         assert learned is not None
@@ -532,8 +542,7 @@ class ModelEstimator:
     def note(self, problem: str = "", waits: str = "") -> LearnerNote:
         """Return what is thought now; ``waits`` is why due proposals wait."""
         rows = [ProposalRow(p.tag, p.what, self._explain_wait(p) or waits) for p in self.proposals.values()]
-        parts = [p for p in self._parts.values() if p.is_named or p.learning.poses >= _FEWEST]
-        watched = [self._describe(p) for p in parts if p.is_named or max(p.way, _ARM * p.turn) > _MOVED]
+        watched = [self._describe(part) for part in self._parts.values() if part.is_of_interest]
         return LearnerNote(watched, dict(self.alarms), rows, self.edits, self.last, problem)
 
     def _describe(self, part: _Part) -> WatchedPart:

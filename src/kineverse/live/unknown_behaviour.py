@@ -16,7 +16,6 @@ from kineverse.grasping import find_handle
 from kineverse.grasping.finger_branches import path_to_root
 from kineverse.manipulation import ArticulatedObject, Outcome, Session, open_unknown
 from kineverse.manipulation.articulated_objects import find_shut_value
-from kineverse.manipulation.swept_volume import find_obstacle
 from kineverse.manipulation.unknown_objects import forget_joint
 from kineverse.manipulation.unknown_objects.unmodelled_joint import free_part
 from kineverse.model.model import Model
@@ -71,6 +70,7 @@ class OpenUnknown(Behaviour):
     """Behaviour that opens parts without a joint, waits for the learner, closes them by name, and ends."""
 
     name = "unknown"
+    overlap = 0.01  # a joint that was learned is off by millimetres
     heeds_edits = False  # the learner edits the model in the middle of a pull
 
     def __init__(
@@ -103,10 +103,6 @@ class OpenUnknown(Behaviour):
                 self._end(part, False, f"'{part}' cannot be closed by name: {why}")
             return None
         shut = find_shut_value(model, coordinate)
-        # What was learned is a little off: parts that touch in truth may overlap.
-        obstacle = find_obstacle(model, coordinate, session.state, shut, robot=session.robot)
-        if obstacle is not None and abs(obstacle.free - shut) < _SHUT:
-            shut = obstacle.free
         one = ArticulatedObject(coordinate, "door", shut, float(session.state[coordinate]))
         if why := self.scene.find_unseen(session, one):
             self._wait("waits", f"'{coordinate}' {why}.")
