@@ -56,15 +56,18 @@ def test_the_word_of_the_supervisor_counts_unless_the_news_are_old():
 
 def test_the_activity_has_its_reason_and_its_results():
     assert "no behaviour" in describe_activity(None)[0]
-    note = ActivityNote("closer", "close a/door", "it is open", done=2, failed=1, last="a/drawer is shut")
+    note = ActivityNote(
+        "closer", "close a/door", "it is open", "pull", done=2, failed=1, last="a/drawer is shut"
+    )
     assert describe_activity(note) == [
         "closer: close a/door",
         "why: it is open",
+        "phase: pull",
         "so far 2 done, 1 failed",
         "last: a/drawer is shut",
     ]
     note.results = [SkillResult(name, "close", name != "d", "it slips", 3.2) for name in "abcd"]
-    assert describe_activity(note)[3:] == [
+    assert describe_activity(note)[4:] == [
         "close d: failed, it slips (3 s)",
         "close c: done (3 s)",
         "close b: done (3 s)",

@@ -122,6 +122,7 @@ def describe_activity(note: ActivityNote | None) -> list[str]:
         return ["nothing is done: no behaviour is there"]
     lines = [f"{note.behaviour}: {note.doing}" if note.doing else note.behaviour]
     lines += [f"why: {note.why}"] if note.why else []
+    lines += [f"phase: {note.phase}"] if note.phase else []
     if note.done or note.failed:
         lines.append(f"so far {note.done} done, {note.failed} failed")
     for result in reversed(note.results[-_MOST_RESULTS:]):
