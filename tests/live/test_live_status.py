@@ -21,6 +21,7 @@ from kineverse.live.streams import (
     ProcessRow,
     ProposalRow,
     RobotNote,
+    SkillResult,
     SupervisorNote,
     TrackerNote,
     WatchedPart,
@@ -35,37 +36,48 @@ def states(*arguments, **options):
 
 
 def test_what_is_gone_or_frozen_is_named():
-    assert states(FRESH) == dict.fromkeys(("world", "track", "behave"), ("running", True))
-    assert states(FRESH | {"tracker": 4.4})["track"] == ("frozen for 4 s", False)
+    assert states(FRESH) == dict.fromkeys(("world", "tracker", "behaviour"), ("running", True))
+    assert states(FRESH | {"tracker": 4.4})["tracker"] == ("frozen for 4 s", False)
     gone = {source: age for source, age in FRESH.items() if source != "tracker"}
-    assert "track" not in states(gone)  # it never was there
-    assert states(gone, known=FRESH)["track"] == ("gone", False)
-    assert states(FRESH, is_online=False)["serve"] == ("gone", False)
-    assert "serve" not in states(FRESH)
+    assert "tracker" not in states(gone)  # it never was there
+    assert states(gone, known=FRESH)["tracker"] == ("gone", False)
+    assert states(FRESH, is_online=False)["server"] == ("gone", False)
+    assert "server" not in states(FRESH)
 
 
 def test_the_word_of_the_supervisor_counts_unless_the_news_are_old():
-    note = SupervisorNote([ProcessRow("track", 7, "starting", 3, 0.25), ProcessRow("view", 8, "running")])
+    note = SupervisorNote([ProcessRow("tracker", 7, "starting", 3, 0.25), ProcessRow("page", 8, "running")])
     rows = {row.name: row for row in list_processes(FRESH | {"tracker": 5.0}, note)}
-    assert rows["track"][:4] == ("track", "starting", "25%", "4")
-    assert not rows["track"].is_well
-    assert rows["view"][:5] == ("view", "running", "", "1", "")
+    assert rows["tracker"][:4] == ("tracker", "starting", "25%", "4")
+    assert not rows["tracker"].is_well
+    assert rows["page"][:5] == ("page", "running", "", "1", "")
     assert rows["world"].news == "robot 10 ms, camera 7 s, truth 30 ms"
 
 
 def test_the_activity_has_its_reason_and_its_results():
     assert "no behaviour" in describe_activity(None)[0]
-    note = ActivityNote("closer", "close a/door", "it is open", done=2, failed=1, last="a/drawer is shut")
+    note = ActivityNote(
+        "closer", "close a/door", "it is open", "pull", done=2, failed=1, last="a/drawer is shut"
+    )
     assert describe_activity(note) == [
         "closer: close a/door",
         "why: it is open",
+        "phase: pull",
         "so far 2 done, 1 failed",
         "last: a/drawer is shut",
+    ]
+    note.results = [SkillResult(name, "close", name != "d", "it slips", 3.2) for name in "abcd"]
+    assert describe_activity(note)[4:] == [
+        "close d: failed, it slips (3 s)",
+        "close c: done (3 s)",
+        "close b: done (3 s)",
     ]
 
 
 def test_the_pace_is_that_of_world_and_control():
-    robot = RobotNote("mujoco", 0.04, [], "emergency stop", 12.3, 4, 2, 7, 1000, 0.9987)
+    robot = RobotNote(
+        "mujoco", 0.04, [], "emergency stop", 12.3, refused=4, late=2, dropped=7, ticks=1000, factor=0.9987
+    )
     stopped, pace = describe_robot(robot, ActivityNote("tour", steps=400, late=1))
     assert stopped == "stopped: emergency stop"
     expected = "force 12 N · real-time factor 0.999 · late 0.2% of ticks, 0.2% of control"

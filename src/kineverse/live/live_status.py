@@ -25,13 +25,14 @@ from .streams import (
     TrackerNote,
     read_note,
 )
+from .supervisor import BEHAVE, SERVER, TRACK, WORLD
 
-SOURCES: Final[Mapping[str, tuple[str, ...]]] = {
-    "world": (ROBOT, CAMERA, TRUTH),
-    "track": (TRACKER,),
-    "learn": (LEARNER,),
-    "behave": (ACTIVITY, COMMANDS),
-    "live": (SUPERVISOR,),
+PUBLISHED: Final[Mapping[str, tuple[str, ...]]] = {
+    WORLD: (ROBOT, CAMERA, TRUTH),
+    TRACK: (TRACKER,),
+    BEHAVE: (ACTIVITY, COMMANDS),
+    "learner": (LEARNER,),
+    "supervisor": (SUPERVISOR,),
 }
 """Sources by the process that publishes them."""
 
@@ -43,9 +44,8 @@ PATIENCE: Final[Mapping[str, float]] = {
 A camera that sees nothing, and a robot that nobody moves, are silent rightly.
 """
 
-SERVER: Final = "serve"
 _UNSEEN = 3.0  # time for which a coordinate may be unseen before it is said [s]
-_MOST_NAMES = 3
+_MOST_NAMES, _MOST_RESULTS = 3, 3
 
 
 class ProcessStatus(NamedTuple):
@@ -84,8 +84,8 @@ def list_processes(
     """
     rows = {} if supervisor is None else {row.name: row for row in supervisor.rows}
     found = []
-    for name in dict.fromkeys((SERVER, *rows, *SOURCES)):
-        sources = [source for source in SOURCES.get(name, ()) if source in ages or source in known]
+    for name in dict.fromkeys((SERVER, *rows, *PUBLISHED)):
+        sources = [source for source in PUBLISHED.get(name, ()) if source in ages or source in known]
         if name == SERVER and not is_online:
             found.append(ProcessStatus(name, "gone", "", "", "", False))
         elif name in rows or sources:
@@ -122,9 +122,13 @@ def describe_activity(note: ActivityNote | None) -> list[str]:
         return ["nothing is done: no behaviour is there"]
     lines = [f"{note.behaviour}: {note.doing}" if note.doing else note.behaviour]
     lines += [f"why: {note.why}"] if note.why else []
+    lines += [f"phase: {note.phase}"] if note.phase else []
     if note.done or note.failed:
         lines.append(f"so far {note.done} done, {note.failed} failed")
-    return lines + ([f"last: {note.last}"] if note.last else [])
+    for result in reversed(note.results[-_MOST_RESULTS:]):
+        ended = "done" if result.done else f"failed, {result.reason}"
+        lines.append(f"{result.skill} {result.what}: {ended} ({result.seconds:.0f} s)")
+    return lines + ([f"last: {note.last}"] if note.last and not note.results else [])
 
 
 def describe_robot(robot: RobotNote | None, activity: ActivityNote | None = None) -> list[str]:
