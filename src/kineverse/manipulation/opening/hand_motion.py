@@ -439,7 +439,7 @@ _STALLED, _PATIENCE, _RESTING = 1e-3, 4.0, 0.5  # least progress [m], [rad] in a
 _LOCKED, _STANDING = 1.5, 1e-3
 """Time [s] after which an object that has not moved yet is not waited for, if the controller plans no speed
 beyond some [m/s], [rad/s] for it either: its own constraints hold it."""
-_AT_CORNER = 0.01  # distance from a corner of a way at which that counts as passed [m], [rad]
+_AT_CORNER = 0.03  # distance from a corner of a way at which that counts as passed [m], [rad]
 _STEPS_AT_TARGET = 10  # number of steps for which an estimate is at the target when a motion ends
 
 
@@ -495,8 +495,11 @@ def move_held(motion: HandMotion, placement: BasePlacement, tolerance: float, ne
             command = controller.step(state)
             # The reference waits for the slowest joint.
             arm = np.abs(reference - state.vector(moving)).max(initial=0.0)
-            off = np.abs(place - state.vector(coordinates))
-            late = max(float(arm), float(off.max()))
+            here = state.vector(coordinates)
+            off = np.abs(place - here)
+            # What a spring takes back is not waited for where it is let back anyway.
+            after = np.abs(row_at(way.values, min(1.0, share + 1.0 / (len(way) - 1))) - here)
+            late = max(float(arm), float(np.minimum(off, after).max()))
         motion.refer_to(share)
         motion.run.act(command.speeds, command)
         passed = share * length
