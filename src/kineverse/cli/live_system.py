@@ -30,8 +30,10 @@ from .live import (
     WORLDS,
     ActivityLines,
     add_far_option,
+    add_force_option,
     add_noise_option,
     add_rounds_option,
+    check_force,
     check_task,
     find_start,
     parse_noise,
@@ -97,6 +99,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add_far_option(parser)
     add_rounds_option(parser)
+    add_force_option(parser)
     parser.add_argument("--headless", action="store_true", help="numbers and a picture instead of a page")
     parser.add_argument(
         "--picture", metavar="PATH", help="write a picture (.png) of what was done at the end"
@@ -115,16 +118,17 @@ def run(arguments: argparse.Namespace) -> int:
     """Run all processes until it is over."""
     begin = time.monotonic()
     extras = {
-        "exchange": True,
         "control": True,
+        "exchange": True,
         "geometry": True,
-        "view": not arguments.headless,
         "mjcf": arguments.world == "mujoco",
         "recording": arguments.record is not None,
+        "view": not arguments.headless,
     }
     require("kineverse live", extras, compiler=True)
     check_picture_path(arguments.picture)
     parse_noise(arguments.noise)
+    check_force(arguments.force_limit)
     check_task(arguments.do, arguments.far, arguments.rounds)
     if arguments.seed < 0:
         raise InvalidValueError(f"--seed is a number from 0 on, not {arguments.seed}.")
@@ -193,8 +197,19 @@ class LiveSystem:
         self.names = [str(one.coordinate) for one in self.objects]
         robot = ["--robot", placed.name]
         noise, seed = ["--noise", arguments.noise], ["--seed", str(arguments.seed)]
+        guard = [] if arguments.force_limit is None else ["--force-limit", str(arguments.force_limit)]
         at = "" if place is None else "@" + ",".join(f"{v!r}" for v in place)
-        world = ["world", address, "--robot", placed.name + at, "--world", arguments.world, *noise, *seed]
+        world = [
+            "world",
+            address,
+            "--robot",
+            placed.name + at,
+            "--world",
+            arguments.world,
+            *noise,
+            *seed,
+            *guard,
+        ]
         brief = arguments.headless and arguments.what is None and arguments.far == 1.0
         far = ["--far", str(_BRIEFLY if brief else arguments.far)]
         rounds = ["--rounds", str(arguments.rounds)]
