@@ -199,8 +199,7 @@ def test_people_stop_the_robot_and_change_the_world_while_it_runs(stand):
             with pytest.raises(KineverseError, match=why):
                 ask(stand.reader, ROBOT, do, **arguments)
         ask(stand.reader, ROBOT, "stop")
-        stand.command(0.1)
-        until(lambda: stand.note().stopped == world_process.EMERGENCY)
+        until(lambda: read_note(stand.reader, ROBOT, RobotNote).stopped == world_process.EMERGENCY)
     finally:
         over.set()
         thread.join()
