@@ -130,10 +130,9 @@ class TrackerProcess:
         """Go on with the tracker of an edited model, once it is made."""
         if self._follower.version == self._version:
             return
-        before = self.belief.tracker.estimate.state
+        before = self.belief
         self.belief, self._version = self._follower.current
-        tracker = self.belief.tracker
-        tracker.reset({s: before[s] for s in tracker.symbols if s in before}, at=self._stamp)
+        self.belief.take_over(before)
         symbols = self._list_symbols()
         if symbols != self._symbols:
             self._symbols = symbols
