@@ -21,7 +21,7 @@ ROS := $(if $(and $(filter Linux-x86_64-3-11,$(subst $() ,-,$(WHEELS))),$(shell 
 .NOTPARALLEL:
 
 help:
-	@echo "make demo    a robot opens and closes a kitchen in the browser (ARGS=--headless: a table, a picture, and end)"
+	@echo "make demo    a robot opens and closes a kitchen, live in the browser (ARGS=--headless: a table, a picture, and end)"
 	@echo "make test    formatter, linter, types, layers, tests"
 	@echo "make ros     an environment with ROS 2, .venv/ros, for kineverse ros without an installation of it"
 	@echo "make sanitize  all C with sanitizers, and the tests that use it (ARGS=--short: a little of each)"
@@ -31,7 +31,7 @@ help:
 	@echo "make clean   remove the environment and what the tools left"
 
 demo: $(VENV)/demo.installed
-	$(BIN)/kineverse demo $(ARGS)
+	$(BIN)/kineverse live $(ARGS)
 
 test: $(VENV)/test.installed $(ROS)
 	$(BIN)/ruff format --check .

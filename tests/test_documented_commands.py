@@ -74,14 +74,13 @@ def at_the_root(tmp_path, monkeypatch):
 def pages(monkeypatch):
     """Fetch each page that is opened, instead of waiting until somebody has seen enough."""
     viewer = pytest.importorskip("kineverse.view.viewer")
-    living, answers = pytest.importorskip("living_kitchen.page"), []
+    answers = []
 
     def fetch(page):
         with urllib.request.urlopen(page.address, timeout=30) as answer:
             answers.append((answer.status, b"<html" in answer.read().lower()))
 
     monkeypatch.setattr(viewer.Viewer, "wait", fetch)
-    monkeypatch.setattr(living.SimulationPage, "wait", fetch)
     for name in ("DISPLAY", "WAYLAND_DISPLAY", "BROWSER"):
         monkeypatch.delenv(name, raising=False)
     return answers
@@ -117,12 +116,6 @@ def test_documented_commands_print_the_documented_output(page, at_the_root, page
         shown = words[0] == "view" or "--view" in words
         opened += shown and not listed and not {"--picture", "--plot"} & {*words}
     assert pages == [(200, True)] * opened
-
-
-def test_the_kitchen_in_motion_serves_its_page(at_the_root, pages, capsys):
-    """That of ``make demo`` is tested in ``cli/test_demo_robot.py``."""
-    assert main(["demo", "--living"]) == 0
-    assert pages == [(200, True)]
 
 
 def test_commands_in_help_texts_parse(capsys):

@@ -26,13 +26,13 @@ def test_help_names_all_commands_and_gives_examples(run):
         "convert",
         "diff",
         "validate",
-        "demo",
+        "live",
         "bench",
         "reproduce",
         "examples",
     ):
         assert word in out
-    for command in ("info", "fk", "view", "convert", "diff", "validate", "demo", "bench", "reproduce"):
+    for command in ("info", "fk", "view", "convert", "diff", "validate", "live", "bench", "reproduce"):
         status, out, _ = run(command, "--help")
         assert status == 0
         assert "examples:" in out
@@ -260,8 +260,7 @@ def test_commands_give_equal_results_without_a_compiler(run, request, words):
 
 @pytest.mark.usefixtures("no_compiler")
 def test_a_missing_compiler_is_reported_only_with_verbose(run, monkeypatch, tmp_path):
-    words = ("demo", "--sliders", "--headless", "--picture", tmp_path / "picture.png")
-    monkeypatch.setattr("kineverse.cli.demo_living.MODELS", ("shelf_door",))  # one model is enough
+    words = ("view", "shelf_door", "--picture", tmp_path / "picture.png")
     # What was not found on one path is logged once, so there are two.
     monkeypatch.setenv("PATH", str(tmp_path / "first"))
     status, _, err = run(*words)
@@ -285,7 +284,6 @@ def test_ctrl_c_gives_status_130_and_an_empty_line(monkeypatch, run):
     [
         (signal.SIGINT, ["view", "shelf_door", "--port", "0"]),
         pytest.param(signal.SIGTERM, ["view", "shelf_door", "--port", "0"], marks=pytest.mark.long),
-        pytest.param(signal.SIGINT, ["demo", "--living", "--port", "0"], marks=pytest.mark.long),
     ],
 )
 def test_pages_end_with_status_0(stop, words, hears_ctrl_c):

@@ -40,8 +40,7 @@ decompose {_EXAMPLES}/door.urdf
 spheres shelf_door
 fit {_EXAMPLES}/poses.csv --parent cupboard --child door
 fit {_EXAMPLES}/poses.csv --parent cupboard --child door --picture fit.png
-demo --headless --what kitchen/oven_door --json
-demo --living --headless --seconds 2
+live --headless --what kitchen/sink_left_upper_drawer --json
 bench --list
 bench call --quick
 reproduce --list

@@ -83,7 +83,6 @@ COMMANDS: Mapping[str, tuple[str, str]] = MappingProxyType(
             "live_system",
             "let a robot open and close a kitchen, live: world, estimators, behaviour, page",
         ),
-        "demo": ("demo", "let a robot open and close the doors and drawers of a kitchen"),
     }
 )
 """Module of each command, with its object after a colon if there are several, and the summary."""
@@ -123,7 +122,7 @@ examples:
   kineverse serve kitchen --store kitchen.db          share it between processes, and keep it
   kineverse info live:kitchen                         the one that is served
   kineverse fit poses.csv --child door                learn a joint from recorded poses
-  kineverse demo --headless                           a robot opens and closes a door, a flap, a drawer
+  kineverse live --headless                           a robot opens and closes a door, a flap, a drawer
 """
 
 

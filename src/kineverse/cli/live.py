@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import gc
 import json
+import math
 import re
 import sys
 from collections.abc import Callable, Iterable, Iterator
@@ -73,6 +74,22 @@ def add_far_option(parser: argparse.ArgumentParser) -> None:
         metavar="SHARE",
         help="share of the way by which they are opened (1)",
     )
+
+
+def add_force_option(parser: argparse.ArgumentParser) -> None:
+    """Declare the limit of the force on the robot."""
+    parser.add_argument(
+        "--force-limit",
+        type=float,
+        metavar="N",
+        help="force on the robot that stops it [N], in MuJoCo (none)",
+    )
+
+
+def check_force(limit: float | None) -> None:
+    """Check ``--force-limit``."""
+    if limit is not None and not 0.0 < limit < math.inf:
+        raise InvalidValueError(f"--force-limit is a positive number of newtons, not {limit:g}.")
 
 
 def add_rounds_option(parser: argparse.ArgumentParser) -> None:
@@ -163,20 +180,22 @@ def _add_world_arguments(parser: argparse.ArgumentParser) -> None:
         default="40ms",
         help="age of a command's state at which the robot stops (40ms)",
     )
-    parser.add_argument(
-        "--force-limit",
-        type=float,
-        metavar="N",
-        help="force on the robot that stops it [N], in MuJoCo (none)",
-    )
+    add_force_option(parser)
     parser.add_argument("--kept", metavar="FILE", help="file that keeps the true state, and where it goes on")
     parser.add_argument("--record", metavar="FILE", help="record all (.mcap), for kineverse view")
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="seed of the noise (0)")
 
 
 def _run_world(arguments: argparse.Namespace) -> int:
-    require("kineverse world", {"exchange": True, "geometry": True, "mjcf": arguments.world == "mujoco"})
+    extras = {
+        "exchange": True,
+        "geometry": True,
+        "mjcf": arguments.world == "mujoco",
+        "recording": arguments.record is not None,
+    }
+    require("kineverse world", extras)
     timeout, sensors = parse_time(arguments.timeout, "--timeout"), parse_noise(arguments.noise)
+    check_force(arguments.force_limit)
     if arguments.seed < 0:
         raise InvalidValueError(f"--seed is a number from 0 on, not {arguments.seed}.")
     if arguments.record is not None:
@@ -320,7 +339,7 @@ def _add_behave_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _run_behave(arguments: argparse.Namespace) -> int:
-    require("kineverse behave", {"exchange": True, "control": True, "geometry": True}, compiler=True)
+    require("kineverse behave", {"control": True, "exchange": True, "geometry": True}, compiler=True)
     if arguments.do in ("open", "close", "unknown") and not arguments.what:
         named = "a part by the name of its frame" if arguments.do == "unknown" else "objects by name"
         raise InvalidValueError(f"--do {arguments.do} is about {named}: --what NAME.")

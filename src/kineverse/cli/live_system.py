@@ -30,8 +30,10 @@ from .live import (
     WORLDS,
     ActivityLines,
     add_far_option,
+    add_force_option,
     add_noise_option,
     add_rounds_option,
+    check_force,
     check_task,
     find_start,
     parse_noise,
@@ -51,8 +53,8 @@ if TYPE_CHECKING:
 HELP = f"""\
 A robot opens and closes the doors and drawers of a kitchen, and then closes whatever is open, also what
 people open, until Ctrl-C. Around a model server run a simulated world in real time, a state estimator, a
-behaviour and a page, each a process; what dies is started again. The terminal shows the processes, what is
-done and why. Keys: e emergency stop, r release, k and a number kill that process, q quit.
+learner, a behaviour and a page, each a process; what dies is started again. The terminal shows the processes,
+what is done and why. Keys: e emergency stop, r release, k and a number kill that process, q quit.
 
 With --headless there is no page: one object of each kind is opened, by 40 % of its way unless --far says
 otherwise, and closed, within 90 s, with numbers and a picture. The exit status is 0 if all of it was done,
@@ -63,6 +65,7 @@ examples:
   kineverse live
   kineverse live kitchens/17 --robot fetch --world mujoco --noise {NOISE},outliers=0.05
   kineverse live --do closer --record run.mcap
+  kineverse live --unknown kitchen/fridge_door
   kineverse live --headless --json --picture kitchen.png"""
 
 KITCHEN, ROBOT = "kitchen", "hsr"
@@ -72,6 +75,8 @@ _BRIEFLY = 0.4  # share of their ways by which they are opened
 _KINDS = ("drawer", "door", "flap")  # kinds of which one each is taken in another kitchen
 _DEADLINE = 84.0  # time from the start after which a run without a page ends [s]
 _INTERRUPTED = 130  # exit status after Ctrl-C, as of all commands
+_UNKNOWN = "unknown"  # behaviour that opens what nobody has described
+_SERVED, _TRUTH = "served.kv.json", "truth.kv.json"  # models of its run
 _RUN = "kineverse-live-"  # folders of runs, by the number of the supervisor's process
 _FIRST_PORT, _PORTS = 8080, 100
 _REDRAWN = 0.5  # time between two tables [s]
@@ -80,7 +85,7 @@ _ADDRESS = re.compile(r"https?://\S+")
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    from kineverse.live.behaviours import BEHAVIOURS  # for start-up time
+    from kineverse.live.behaviour_process import BEHAVIOURS  # for start-up time
 
     parser.add_argument("kitchen", metavar="KITCHEN", nargs="?", default=KITCHEN, help=f"a model ({KITCHEN})")
     parser.add_argument(
@@ -88,15 +93,22 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--world", choices=WORLDS, default=WORLDS[0], help=f"the world ({WORLDS[0]})")
     add_noise_option(parser)
-    parser.add_argument("--do", choices=[*BEHAVIOURS], default="tour", help="the behaviour (tour)")
+    known = [name for name in BEHAVIOURS if name != _UNKNOWN]
+    parser.add_argument("--do", choices=known, default="tour", help="the behaviour (tour)")
     parser.add_argument(
         "--what",
         nargs="+",
         metavar="COORDINATE",
         help="objects by name or pattern ('*_door'), in this order (all; with --headless one of each kind)",
     )
+    parser.add_argument(
+        "--unknown",
+        metavar="COORDINATE",
+        help="nobody has described the joint of this object: it is opened, learned, and closed by name",
+    )
     add_far_option(parser)
     add_rounds_option(parser)
+    add_force_option(parser)
     parser.add_argument("--headless", action="store_true", help="numbers and a picture instead of a page")
     parser.add_argument(
         "--picture", metavar="PATH", help="write a picture (.png) of what was done at the end"
@@ -115,22 +127,23 @@ def run(arguments: argparse.Namespace) -> int:
     """Run all processes until it is over."""
     begin = time.monotonic()
     extras = {
-        "exchange": True,
         "control": True,
+        "exchange": True,
         "geometry": True,
-        "view": not arguments.headless,
         "mjcf": arguments.world == "mujoco",
         "recording": arguments.record is not None,
+        "view": not arguments.headless,
     }
     require("kineverse live", extras, compiler=True)
     check_picture_path(arguments.picture)
     parse_noise(arguments.noise)
+    check_force(arguments.force_limit)
     check_task(arguments.do, arguments.far, arguments.rounds)
     if arguments.seed < 0:
         raise InvalidValueError(f"--seed is a number from 0 on, not {arguments.seed}.")
     if arguments.seconds is not None and not 0.0 < arguments.seconds < math.inf:
         raise InvalidValueError(f"--seconds is a positive number, not {arguments.seconds:g}.")
-    brief = arguments.headless and arguments.what is None
+    brief = arguments.headless and arguments.what is None and arguments.unknown is None
     seconds = arguments.seconds or (_DEADLINE if brief else math.inf)
     finished = False
     with handle_interrupts(), ExitStack() as stack:
@@ -172,14 +185,13 @@ class LiveSystem:
     """Processes of a live system, with what is shown of them."""
 
     def __init__(self, arguments: argparse.Namespace, folder: Path) -> None:
-        from kineverse.live.supervisor import BEHAVE, SERVE, TRACK, VIEW, WORLD, Supervisor
+        from kineverse.live.supervisor import BEHAVE, LEARN, SERVE, TRACK, VIEW, WORLD, Supervisor
         from kineverse.manipulation import find_articulated_objects, place_robot
 
         self._arguments, self._folder = arguments, folder
         self.name = _choose_name(arguments.name)
         address = SCHEME + self.name
         source, place = parse_robot(arguments.robot)
-        serve = ["serve", arguments.kitchen, "--robot", source]
         store = ["--name", self.name, "--store", str(folder / "model.db")]
         with show_activity(f"reading {arguments.kitchen} and {source}"):
             self.model = _load(arguments.kitchen)
@@ -189,32 +201,30 @@ class LiveSystem:
             self.robot = Robot.of(self.model, placed.name)
             find_start(self.model, placed.name, place)  # raises for a place that is none
             found = find_articulated_objects(self.model, self.robot)
-        self.objects = _choose_objects(found, arguments.what, arguments.headless)
-        self.names = [str(one.coordinate) for one in self.objects]
+        self.do = arguments.do if arguments.unknown is None else _UNKNOWN
+        model, truth, served = arguments.kitchen, list[str](), ["--robot", source]
+        if arguments.unknown is None:
+            objects = _choose_objects(found, arguments.what, arguments.headless)
+            self.names = [str(one.coordinate) for one in objects]
+        else:
+            self.names, served = [self._forget(arguments.unknown)], []
+            model, truth = str(folder / _SERVED), ["--truth", str(folder / _TRUTH)]
         robot = ["--robot", placed.name]
         noise, seed = ["--noise", arguments.noise], ["--seed", str(arguments.seed)]
+        guard = [] if arguments.force_limit is None else ["--force-limit", str(arguments.force_limit)]
         at = "" if place is None else "@" + ",".join(f"{v!r}" for v in place)
         world = ["world", address, "--robot", placed.name + at, "--world", arguments.world, *noise, *seed]
         brief = arguments.headless and arguments.what is None and arguments.far == 1.0
         far = ["--far", str(_BRIEFLY if brief else arguments.far)]
         rounds = ["--rounds", str(arguments.rounds)]
         commands = {
-            SERVE: [*serve, *store],
-            WORLD: [*world, "--kept", str(folder / "world.state")],
+            SERVE: ["serve", model, *served, *store],
+            WORLD: [*world, *guard, *truth, "--kept", str(folder / "world.state")],
             TRACK: ["track", address, *robot, *noise],
-            BEHAVE: [
-                "behave",
-                address,
-                *robot,
-                *seed,
-                *far,
-                *rounds,
-                "--do",
-                arguments.do,
-                "--what",
-                *self.names,
-            ],
+            BEHAVE: ["behave", address, *robot, *seed, *far, *rounds, "--do", self.do, "--what", *self.names],
         }
+        if not arguments.headless or self.do == _UNKNOWN:
+            commands[LEARN] = ["learn", address]
         if not arguments.headless:
             host = ["--host", arguments.host] if arguments.host else []
             quiet = ["--no-browser"] if arguments.no_browser else []
@@ -223,6 +233,15 @@ class LiveSystem:
         self._stills: LiveStills | None = None
         self._stack = ExitStack()
         self._screen = Screen(self, sys.stderr if arguments.json else sys.stdout)
+
+    def _forget(self, what: str) -> str:
+        """Write the model of the truth, and one without the joint of an object; return its part."""
+        from kineverse.live import make_unknown_scene  # for start-up time
+
+        scene = make_unknown_scene(self.model, what)
+        self.model.save(self._folder / _TRUTH)
+        scene.model.save(self._folder / _SERVED)
+        return scene.part
 
     def start(self) -> None:
         """Start all processes."""
@@ -256,29 +275,32 @@ class LiveSystem:
         """Have a behaviour that is started again do what is left, and a page open no second window."""
         if child.name == "view" and "--no-browser" not in child.words:
             child.words.append("--no-browser")
-        if child.name != "behave" or self._arguments.do == "closer":
+        if child.name != "behave" or self.do in ("closer", _UNKNOWN):
             return
         rounds = {name: self._arguments.rounds - self._count(name) for name in self.names}
         left = [name for name, number in rounds.items() if number > 0]
         head = child.words[: child.words.index("--do")]
-        task = ["--do", self._arguments.do, "--rounds", str(max(rounds.values()))]
+        task = ["--do", self.do, "--rounds", str(max(rounds.values()))]
         child.words = [*head, *(task if left else ["--do", "closer"]), "--what", *(left or self.names)]
 
     @property
     def _skills(self) -> tuple[str, ...]:
         """Skills of which the results count."""
-        return {"open": ("open",), "close": ("close",)}.get(self._arguments.do, ("open", "close"))
+        return {"open": ("open",), "close": ("close",)}.get(self.do, ("open", "close"))
 
     def _count(self, name: str) -> int:
         """Return how often an object was handled as wanted."""
         return len(self.supervisor.status.list_results(name, self._skills[-1]))
 
+    def _is_handled(self, name: str) -> bool:
+        return self.do != _UNKNOWN and self._count(name) >= self._arguments.rounds
+
     @property
     def is_over(self) -> bool:
         """Whether all objects were handled."""
-        return self._arguments.do != "closer" and all(
-            self._count(name) >= self._arguments.rounds for name in self.names
-        )
+        if self.do == _UNKNOWN:
+            return self.supervisor.children["behave"].is_done
+        return self.do != "closer" and all(map(self._is_handled, self.names))
 
     @property
     def is_done(self) -> bool:
@@ -290,8 +312,10 @@ class LiveSystem:
         status, rows = self.supervisor.status, []
         for name in self.names:
             found = [one for skill in self._skills for one in status.list_results(name, skill)]
+            if self.do == _UNKNOWN:  # it is closed by the name that its joint has got
+                found = status.results
             failed = [f"{one.skill}: {one.reason}" for one in found if not one.done]
-            if not failed and self._arguments.do != "closer" and self._count(name) < self._arguments.rounds:
+            if not failed and self.do != "closer" and not (self.is_over or self._is_handled(name)):
                 failed = [f"The time was up after {len(found)} of {self._wanted} skills."]
             rows.append(
                 {

@@ -199,6 +199,7 @@ class Behaviour:
         if why := self._sessions.find_problem(session):
             return why
         try:
+            session.refresh()
             session.await_readings()
         except SkillError as error:
             return str(error)
