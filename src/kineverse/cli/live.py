@@ -7,7 +7,7 @@ import gc
 import json
 import re
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, closing, contextmanager
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -21,10 +21,11 @@ from .plan_arguments import find_robot_name, parse_robot
 
 if TYPE_CHECKING:
     from kineverse.exchange import LiveModel
-    from kineverse.live.streams import ActivityNote
+    from kineverse.live.streams import ActivityNote, SkillResult
     from kineverse.model.model_view import ModelView
     from kineverse.state import State
-    from kineverse.worlds import Sensors, SimulatedWorld
+    from kineverse.worlds import Sensors
+    from kineverse.worlds.simulated_world import ChangeableWorld
 
 NOISE = "3mm+3mm/m,0.5deg,30Hz"  # noise of the observed poses, unless another one is asked for
 WORLDS = ("kinematic", "mujoco")
@@ -73,8 +74,21 @@ def add_far_option(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def check_far(far: float) -> None:
-    """Check ``--far``."""
+def add_rounds_option(parser: argparse.ArgumentParser) -> None:
+    """Declare how often things are opened and closed."""
+    parser.add_argument(
+        "--rounds", type=int, default=1, metavar="N", help="how often each is opened and closed (1)"
+    )
+
+
+def check_task(do: str, far: float, rounds: int) -> None:
+    """Check ``--far`` and ``--rounds`` of a behaviour."""
+    if rounds < 1 or (rounds > 1 and do == "closer"):
+        raise InvalidValueError(
+            f"--rounds {rounds}: a closer has no rounds; --do tour has."
+            if rounds > 1
+            else f"--rounds is a number from 1 on, not {rounds}."
+        )
     if not 0.1 <= far <= 1.0:
         raise InvalidValueError(f"--far is a share of the way between 0.1 and 1, not {far:g}.")
 
@@ -148,6 +162,12 @@ def _add_world_arguments(parser: argparse.ArgumentParser) -> None:
         default="40ms",
         help="age of a command's state at which the robot stops (40ms)",
     )
+    parser.add_argument(
+        "--force-limit",
+        type=float,
+        metavar="N",
+        help="force on the robot that stops it [N], in MuJoCo (none)",
+    )
     parser.add_argument("--kept", metavar="FILE", help="file that keeps the true state, and where it goes on")
     parser.add_argument("--record", metavar="FILE", help="record all (.mcap), for kineverse view")
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="seed of the noise (0)")
@@ -171,7 +191,7 @@ def _run_world(arguments: argparse.Namespace) -> int:
         truth = None if arguments.truth is None else _load_truth(arguments.truth, robot)
         start = find_start(truth or snapshot, robot, place)
 
-        def make(model: ModelView) -> SimulatedWorld:
+        def make(model: ModelView) -> ChangeableWorld:
             from kineverse.worlds import KinematicWorld, MujocoWorld  # for start-up time
 
             options: dict[str, Any] = {"sensors": sensors, "seed": arguments.seed}
@@ -183,7 +203,13 @@ def _run_world(arguments: argparse.Namespace) -> int:
             world = stack.enter_context(
                 closing(
                     WorldProcess(
-                        live, make, start, timeout=timeout, kept=arguments.kept, follows=truth is None
+                        live,
+                        make,
+                        start,
+                        timeout=timeout,
+                        kept=arguments.kept,
+                        follows=truth is None,
+                        force_limit=arguments.force_limit,
                     )
                 )
             )
@@ -284,6 +310,7 @@ def _add_behave_arguments(parser: argparse.ArgumentParser) -> None:
         "--what", nargs="+", metavar="COORDINATE", help="objects by name or pattern ('*_door') (all)"
     )
     add_far_option(parser)
+    add_rounds_option(parser)
     parser.add_argument("--hand", metavar="FRAME", help="hand of the robot (the likeliest gripper)")
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="seed of all searches (0)")
     parser.add_argument(
@@ -297,7 +324,7 @@ def _run_behave(arguments: argparse.Namespace) -> int:
         raise InvalidValueError(f"--do {arguments.do} is about objects by name: --what COORDINATE.")
     if arguments.seed < 0:
         raise InvalidValueError(f"--seed is a number from 0 on, not {arguments.seed}.")
-    check_far(arguments.far)
+    check_task(arguments.do, arguments.far, arguments.rounds)
     from kineverse.live import BehaviourProcess  # for start-up time
     from kineverse.live.behaviours import BEHAVIOURS  # for start-up time
     from kineverse.planning.bindings import request_planner  # for start-up time
@@ -313,8 +340,10 @@ def _run_behave(arguments: argparse.Namespace) -> int:
                 tell(note)
                 lines.print(note)
 
+            rounds = {} if arguments.do == "closer" else {"rounds": arguments.rounds}
             return BEHAVIOURS[arguments.do](
                 sessions,
+                **rounds,
                 patterns=arguments.what,
                 report=report,
                 hand=arguments.hand,
@@ -330,15 +359,15 @@ def _run_behave(arguments: argparse.Namespace) -> int:
             process.run()
             done = process.behaviour.is_done and not process.behaviour.note.failed
     if arguments.json:
-        print(json.dumps({"done": done, "results": results_as_data(process.behaviour.note)}))
+        print(json.dumps({"done": done, "results": results_as_data(process.behaviour.note.results)}))
     return 0 if done else 1
 
 
-def results_as_data(note: ActivityNote) -> list[dict[str, Any]]:
-    """Return the results of a behaviour as JSON data, times in [s]."""
+def results_as_data(results: Iterable[SkillResult]) -> list[dict[str, Any]]:
+    """Return results of skills as JSON data, times in [s]."""
     return [
         {"what": one.what, "skill": one.skill, "done": one.done, "reason": one.reason, "seconds": one.seconds}
-        for one in note.results
+        for one in results
     ]
 
 

@@ -31,9 +31,11 @@ from .live import (
     ActivityLines,
     add_far_option,
     add_noise_option,
-    check_far,
+    add_rounds_option,
+    check_task,
     find_start,
     parse_noise,
+    results_as_data,
 )
 from .output import format_table, join_lines, shorten_text, show_activity
 from .pages import add_page_options, check_picture_path, handle_interrupts
@@ -41,7 +43,7 @@ from .plan_arguments import parse_robot
 
 if TYPE_CHECKING:
     from kineverse.live.children import Child
-    from kineverse.live.supervisor import LiveRow, LiveStatus, Supervisor
+    from kineverse.live.supervisor import LiveStatus, Supervisor
     from kineverse.manipulation import ArticulatedObject
     from kineverse.model.model import Model
     from kineverse.worlds import Robot
@@ -94,11 +96,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="objects by name or pattern ('*_door'), in this order (all; with --headless one of each kind)",
     )
     add_far_option(parser)
+    add_rounds_option(parser)
     parser.add_argument("--headless", action="store_true", help="numbers and a picture instead of a page")
     parser.add_argument(
         "--picture", metavar="PATH", help="write a picture (.png) of what was done at the end"
     )
-    parser.add_argument("--seconds", type=float, metavar="S", help="end after this time (--headless: 84)")
+    parser.add_argument(
+        "--seconds", type=float, metavar="S", help="end after this time (84 for the objects of --headless)"
+    )
     parser.add_argument("--record", metavar="FILE", help="record all (.mcap), for kineverse view")
     parser.add_argument("--json", action="store_true", help="one JSON object on standard output")
     parser.add_argument("--name", metavar="NAME", help="name of the model server (live)")
@@ -120,12 +125,13 @@ def run(arguments: argparse.Namespace) -> int:
     require("kineverse live", extras, compiler=True)
     check_picture_path(arguments.picture)
     parse_noise(arguments.noise)
-    check_far(arguments.far)
+    check_task(arguments.do, arguments.far, arguments.rounds)
     if arguments.seed < 0:
         raise InvalidValueError(f"--seed is a number from 0 on, not {arguments.seed}.")
     if arguments.seconds is not None and not 0.0 < arguments.seconds < math.inf:
         raise InvalidValueError(f"--seconds is a positive number, not {arguments.seconds:g}.")
-    seconds = arguments.seconds or (_DEADLINE if arguments.headless else math.inf)
+    brief = arguments.headless and arguments.what is None
+    seconds = arguments.seconds or (_DEADLINE if brief else math.inf)
     finished = False
     with handle_interrupts(), ExitStack() as stack:
         system = LiveSystem(arguments, stack.enter_context(run_folder()))
@@ -166,7 +172,7 @@ class LiveSystem:
     """Processes of a live system, with what is shown of them."""
 
     def __init__(self, arguments: argparse.Namespace, folder: Path) -> None:
-        from kineverse.live.supervisor import BEHAVE, PAGE, SERVER, TRACK, WORLD, Supervisor
+        from kineverse.live.supervisor import BEHAVE, SERVE, TRACK, VIEW, WORLD, Supervisor
         from kineverse.manipulation import find_articulated_objects, place_robot
 
         self._arguments, self._folder = arguments, folder
@@ -189,17 +195,30 @@ class LiveSystem:
         noise, seed = ["--noise", arguments.noise], ["--seed", str(arguments.seed)]
         at = "" if place is None else "@" + ",".join(f"{v!r}" for v in place)
         world = ["world", address, "--robot", placed.name + at, "--world", arguments.world, *noise, *seed]
-        far = ["--far", str(_BRIEFLY if arguments.headless and arguments.far == 1.0 else arguments.far)]
+        brief = arguments.headless and arguments.what is None and arguments.far == 1.0
+        far = ["--far", str(_BRIEFLY if brief else arguments.far)]
+        rounds = ["--rounds", str(arguments.rounds)]
         commands = {
-            SERVER: [*serve, *store],
+            SERVE: [*serve, *store],
             WORLD: [*world, "--kept", str(folder / "world.state")],
             TRACK: ["track", address, *robot, *noise],
-            BEHAVE: ["behave", address, *robot, *seed, *far, "--do", arguments.do, "--what", *self.names],
+            BEHAVE: [
+                "behave",
+                address,
+                *robot,
+                *seed,
+                *far,
+                *rounds,
+                "--do",
+                arguments.do,
+                "--what",
+                *self.names,
+            ],
         }
         if not arguments.headless:
             host = ["--host", arguments.host] if arguments.host else []
             quiet = ["--no-browser"] if arguments.no_browser else []
-            commands[PAGE] = ["view", address, "--port", str(_find_port(arguments.port)), *host, *quiet]
+            commands[VIEW] = ["view", address, "--port", str(_find_port(arguments.port)), *host, *quiet]
         self.supervisor = Supervisor(self.name, commands, folder, ending=(BEHAVE,), prepare=self._prepare)
         self._stills: LiveStills | None = None
         self._stack = ExitStack()
@@ -235,27 +254,31 @@ class LiveSystem:
 
     def _prepare(self, child: Child, status: LiveStatus) -> None:
         """Have a behaviour that is started again do what is left, and a page open no second window."""
-        if child.name == "page" and "--no-browser" not in child.words:
+        if child.name == "view" and "--no-browser" not in child.words:
             child.words.append("--no-browser")
-        if child.name != "behaviour" or self._arguments.do == "closer":
+        if child.name != "behave" or self._arguments.do == "closer":
             return
-        left = [name for name in self.names if not self._is_handled(name)]
+        rounds = {name: self._arguments.rounds - self._count(name) for name in self.names}
+        left = [name for name, number in rounds.items() if number > 0]
         head = child.words[: child.words.index("--do")]
-        do = self._arguments.do if left else "closer"
-        child.words = [*head, "--do", do, "--what", *(left or self.names)]
+        task = ["--do", self._arguments.do, "--rounds", str(max(rounds.values()))]
+        child.words = [*head, *(task if left else ["--do", "closer"]), "--what", *(left or self.names)]
 
     @property
     def _skills(self) -> tuple[str, ...]:
         """Skills of which the results count."""
         return {"open": ("open",), "close": ("close",)}.get(self._arguments.do, ("open", "close"))
 
-    def _is_handled(self, name: str) -> bool:
-        return all((name, skill) in self.supervisor.status.results for skill in self._skills)
+    def _count(self, name: str) -> int:
+        """Return how often an object was handled as wanted."""
+        return len(self.supervisor.status.list_results(name, self._skills[-1]))
 
     @property
     def is_over(self) -> bool:
-        """Whether there is a result for each object."""
-        return self._arguments.do != "closer" and all(map(self._is_handled, self.names))
+        """Whether all objects were handled."""
+        return self._arguments.do != "closer" and all(
+            self._count(name) >= self._arguments.rounds for name in self.names
+        )
 
     @property
     def is_done(self) -> bool:
@@ -264,24 +287,28 @@ class LiveSystem:
 
     def list_objects(self) -> list[dict[str, Any]]:
         """Return what became of each object, as JSON data."""
-        results, rows = self.supervisor.status.results, []
+        status, rows = self.supervisor.status, []
         for name in self.names:
-            found = {skill: results.get((name, skill)) for skill in self._skills}
-            missing = next((skill for skill, one in found.items() if one is None), None)
-            wrong = next((one for one in found.values() if one is not None and not one.done), None)
-            reason = wrong.reason if wrong is not None else ""
-            if wrong is None and missing is not None:
-                reason = f"The time was up before it was {'opened' if missing == 'open' else 'closed'}."
+            found = [one for skill in self._skills for one in status.list_results(name, skill)]
+            failed = [f"{one.skill}: {one.reason}" for one in found if not one.done]
+            if not failed and self._arguments.do != "closer" and self._count(name) < self._arguments.rounds:
+                failed = [f"The time was up after {len(found)} of {self._wanted} skills."]
             rows.append(
                 {
                     "what": name,
                     "robot": self.robot.name,
-                    "done": not reason,
-                    "reason": join_lines(reason),
-                    "seconds": sum(one.seconds for one in found.values() if one is not None),
+                    "done": not failed,
+                    "reason": join_lines(" ".join(failed)),
+                    "seconds": sum(one.seconds for one in found),
+                    "results": results_as_data(found),
                 }
             )
         return rows
+
+    @property
+    def _wanted(self) -> int:
+        rounds: int = self._arguments.rounds
+        return rounds * len(self._skills)
 
     def report(self) -> None:
         """Print what was done, and write the picture."""
@@ -319,7 +346,7 @@ class LiveSystem:
             print(format_table(("object", "done", "time", "reason"), rows, "<<><"))
         numbers = [] if factor is None else [f"real-time factor {factor:.4f}"]
         numbers += [] if late is None else [f"{100 * late:.2f} % of {status.steps} control steps late"]
-        numbers += [f"{status.restarts} restarts"]
+        numbers += [f"{number} restarts of {name}" for name, number in status.restarts.items()]
         print(", ".join(numbers), flush=True)
         if shown is not None:
             print(f"picture: {shown}", flush=True)
@@ -386,6 +413,7 @@ class LiveStills:
         self.state: State = self._default  # the true one
         self._stills = SkillStills(robot, self)
         self._drawn: set[str] = set()
+        self._told = 0  # results that were looked at
 
     def look(self, status: LiveStatus) -> None:
         """Keep the present moment, and end the row of an object that was handled."""
@@ -399,10 +427,11 @@ class LiveStills:
         way = np.frombuffer(note.way).reshape(-1, 3) if len(note.way) % 24 == 0 and note.way else None
         reference = None if way is None else SimpleNamespace(ahead=way)
         step: Any = SimpleNamespace(state=belief or truth, phase=note.phase, reference=reference)
-        for (what, skill), _ in [*status.results.items()]:
-            if skill == "close" and what not in self._drawn:
-                self._drawn.add(what)
-                self._stills.end_row(self._known[what])
+        for one in status.results[self._told :]:
+            self._told += 1
+            if one.skill == "close" and one.what not in self._drawn:
+                self._drawn.add(one.what)
+                self._stills.end_row(self._known[one.what])
         if note.doing.startswith(("opens", "closes", "pushes")):
             self._stills.watch(step, note.doing.startswith("opens"))
 
@@ -455,7 +484,7 @@ class Screen:
         return ends
 
     def _find_address(self) -> None:
-        page = self._system.supervisor.children.get("page")
+        page = self._system.supervisor.children.get("view")
         text = "" if page is None or not page.log.is_file() else page.log.read_text("utf-8", "replace")
         if found := _ADDRESS.search(text):
             self._address = found[0]
@@ -472,18 +501,36 @@ class Screen:
             self._lines.print(status.activity)
 
     def _draw(self, status: LiveStatus) -> None:
-        width = shutil.get_terminal_size().columns - 1
+        from kineverse.live.live_status import describe_all  # for start-up time
+
+        supervisor, width = self._system.supervisor, shutil.get_terminal_size().columns - 1
         lines = [f"{SCHEME}{self._system.name}   {self._address}".rstrip()]
-        lines += format_table(
-            _HEAD, [_cells(k, row) for k, row in enumerate(status.rows, 1)], _ALIGN, width
-        ).split("\n")
-        lines += describe_status(status)
+        lines += self._list_processes(status, width)
+        lines += [join_lines(line) for line in describe_all(supervisor.reader)]
+        if status.activity is not None and status.activity.phase:
+            lines.append(f"phase: {join_lines(status.activity.phase)}")
         lines.append(self._answer or _KEYS)
         up = f"\033[{self._height}A" if self._height else ""
         text = "".join(f"\033[2K{shorten_text(line, width)}\n" for line in lines)
         below = "\033[J"
         print(f"{up}\r{text}{below}", end="", file=self._stream, flush=True)
         self._height = len(lines)
+
+    def _list_processes(self, status: LiveStatus, width: int) -> list[str]:
+        """Return a table of the processes, with the numbers by which they are killed."""
+        from kineverse.live.live_status import HEAD, list_processes  # for start-up time
+        from kineverse.live.streams import SUPERVISOR, SupervisorNote  # for start-up time
+
+        supervisor = self._system.supervisor
+        ages = {name: age for name, age in supervisor.reader.age.items() if name != SUPERVISOR}
+        numbers = {name: str(k) for k, name in enumerate(supervisor.children, 1)}
+        pids = {row.name: str(row.pid or "") for row in status.rows}
+        found = list_processes(ages, SupervisorNote(status.rows), is_online=supervisor.is_online)
+        rows = [
+            (numbers.get(p.name, ""), pids.get(p.name, ""), p.name, p.state, p.load, p.starts, p.news)
+            for p in found
+        ]
+        return format_table(("", "pid", *HEAD), rows, ">><<>><", width).split("\n")
 
     def _read_keys(self, status: LiveStatus) -> bool:
         """Do what the keys ask for; return True to end."""
@@ -511,42 +558,7 @@ class Screen:
         return False
 
 
-_HEAD = ("", "process", "pid", "state", "news", "CPU", "restarts")
-_ALIGN = ">< ><>>>".replace(" ", "")
 _KEYS = "e: emergency stop, r: release, k and a number: kill that process, q: quit"
-
-
-def _cells(number: int, row: LiveRow) -> list[str]:
-    news = "" if math.isnan(row.age) else "-" if math.isinf(row.age) else f"{row.age:.2f} s"
-    cpu = "" if math.isnan(row.cpu) else f"{100 * row.cpu:.0f} %"
-    return [
-        str(number),
-        row.name,
-        str(row.pid or ""),
-        shorten_text(row.state, 60),
-        news,
-        cpu,
-        str(row.restarts),
-    ]
-
-
-def describe_status(status: LiveStatus) -> list[str]:
-    """Return lines on what is done and why, on the world, and on the results."""
-    lines, robot, note = [], status.robot, status.activity
-    if robot is not None:
-        force = "" if math.isnan(robot.force) else f", {robot.force:.0f} N"
-        lines.append(
-            f"{robot.world} world: real-time factor {robot.factor:.4f}, {robot.dropped} ticks dropped, "
-            f"{robot.refused} commands refused{force}"
-        )
-        if robot.stopped:
-            lines.append(f"STOPPED: {robot.stopped}")
-    if note is not None:
-        phase = f" [{join_lines(note.phase)}]" if note.phase else ""
-        lines.append(f"{note.behaviour} {note.doing}: {join_lines(note.why)}{phase}")
-        done = sum(one.done for one in status.results.values())
-        lines.append(f"{done} of {len(status.results)} done. {join_lines(note.last)}")
-    return lines
 
 
 @contextmanager

@@ -13,6 +13,7 @@ import kineverse as kv
 from kineverse.control import Hold
 from kineverse.errors import FormatError, InvalidValueError, UnknownNameError, suggest
 from kineverse.manipulation import place_robot
+from kineverse.model.model_view import ModelView
 from kineverse.planning.manifold import hold_frames
 from kineverse.planning.planning_space import free_coordinates
 
@@ -134,7 +135,7 @@ def parse_robot(text: str) -> tuple[str, tuple[float, ...] | None]:
     return source, tuple(parse_value(part) for part in parts)
 
 
-def find_robot_name(model: kv.Model, wanted: str | None) -> str:
+def find_robot_name(model: ModelView, wanted: str | None) -> str:
     """Return the prefix of a robot's names in a served model; without a name, of the only one in it."""
     from kineverse.manipulation.robot_sources import SHIPPED  # for start-up time
     from kineverse.worlds import Robot  # for start-up time

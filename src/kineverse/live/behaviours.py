@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -197,6 +197,7 @@ class Behaviour:
         if why := self._sessions.find_problem(session):
             return why
         try:
+            session.refresh()
             session.await_readings()
         except SkillError as error:
             return str(error)
@@ -281,7 +282,7 @@ class Behaviour:
         handle = self.scene.find_held(session)
         if handle is None:
             return True
-        self._say("lets go", f"The hand is at '{handle.frame}', and nobody knows why.")
+        self._say("lets go", f"The hand is at '{handle.frame}', as after a skill that was broken off.")
         run = SkillRun(session, handle.coordinate, _LETTING_GO)
         motion = self.scene.motion(run, handle, self.seed)
 
@@ -464,9 +465,11 @@ class Closer(Behaviour):
 class Agenda(Closer):
     """Behaviour that does some tasks one after the other, and tries each a few times."""
 
-    def __init__(self, sessions: SessionSource, skills: Iterable[bool], **options: object) -> None:
-        super().__init__(sessions, **options)  # type: ignore[arg-type]
-        self._skills = tuple(skills)
+    def __init__(
+        self, sessions: SessionSource, skills: Iterable[bool], *, rounds: int = 1, **options: Any
+    ) -> None:
+        super().__init__(sessions, **options)
+        self._skills = tuple(skills) * rounds
         self._left: list[tuple[str, bool]] | None = None
         self._tries, self._unseen_since = 0, -np.inf
 
@@ -479,14 +482,16 @@ class Agenda(Closer):
         name, opening = self._left[0]
         one = self.scene.names.get(name)
         if one is None:
-            return self._give_up(None, "The model has it no longer.")
+            self._give_up(None, "The model has it no longer.")
+            return None
         why = "It was asked for." if not self._tries else f"This is try {self._tries + 1}."
         task = Task(one, opening, why, far=self._far)
         if why := self.scene.find_unseen(session, one):
             if self._unseen_since < 0.0:
                 self._unseen_since = session.time
             if session.time - self._unseen_since > _UNSEEN:
-                return self._give_up(task, f"'{name}' {why}.")
+                self._give_up(task, f"'{name}' {why}.")
+                return None
             self._wait("waits", f"'{name}' {why}.")
             return None
         self._unseen_since = -np.inf
@@ -535,7 +540,7 @@ class OpenByName(Agenda):
 
     name = "open"
 
-    def __init__(self, sessions: SessionSource, **options: object) -> None:
+    def __init__(self, sessions: SessionSource, **options: Any) -> None:
         super().__init__(sessions, (True,), **options)
 
 
@@ -544,7 +549,7 @@ class CloseByName(Agenda):
 
     name = "close"
 
-    def __init__(self, sessions: SessionSource, **options: object) -> None:
+    def __init__(self, sessions: SessionSource, **options: Any) -> None:
         super().__init__(sessions, (False,), **options)
 
 
@@ -553,7 +558,7 @@ class Tour(Agenda):
 
     name = "tour"
 
-    def __init__(self, sessions: SessionSource, **options: object) -> None:
+    def __init__(self, sessions: SessionSource, **options: Any) -> None:
         super().__init__(sessions, (True, False), **options)
 
     def go_on(self, session: Session) -> Task | None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -74,7 +74,7 @@ class LiveRobot:
     """
 
     remarks: tuple[str, ...] = ()
-    observed: tuple[str, ...] = ()  # the camera of its world chooses the frames
+    observed: Sequence[str] = ()  # the camera of its world chooses the frames
 
     def __init__(self, model: ModelView, robot: Robot | str, connection: Connection) -> None:
         self.model, self.robot = model, Robot.of(model, robot)

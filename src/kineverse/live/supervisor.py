@@ -19,12 +19,11 @@ from kineverse.exchange.state import StateReader
 from kineverse.model.frame import WORLD as WORLD_FRAME
 
 from .children import Child, stop_all
+from .live_status import SOURCES
 from .streams import (
     ACTIVITY,
-    LEARNER,
     ROBOT,
     SUPERVISOR,
-    TRACKER,
     ActivityNote,
     ProcessRow,
     RobotNote,
@@ -35,10 +34,8 @@ from .streams import (
     read_note,
 )
 
-SERVER, WORLD, TRACK, BEHAVE, PAGE = "server", "world", "tracker", "behaviour", "page"
-SOURCES: Mapping[str, str] = {WORLD: ROBOT, TRACK: TRACKER, BEHAVE: ACTIVITY, "learner": LEARNER}
-"""Stream of each process, whose age tells whether it goes on."""
-_SILENT = 2.0  # age of the last word of a process from which on it counts as frozen [s]
+SERVE, WORLD, TRACK, LEARN, BEHAVE, VIEW = "serve", "world", "track", "learn", "behave", "view"
+"""Names of processes, which are those of their commands."""
 _STARTING = 30.0  # longest time until a process has said something [s]
 _SERVING = 60.0  # longest time until the model server is there [s]
 _PERIOD = 0.1  # time between two looks [s]
@@ -46,32 +43,24 @@ _TOLD = 0.5  # time between two notes on the processes [s]
 
 
 @dataclass
-class LiveRow:
-    """Process of a live system, as a table shows it."""
-
-    name: str
-    pid: int
-    state: str  # running, starting, frozen, or how it has ended
-    age: float  # time since its last word [s]; NaN without a stream
-    cpu: float  # share of a core; NaN where the system does not tell
-    restarts: int
-
-
-@dataclass
 class LiveStatus:
     """State of a live system."""
 
-    rows: list[LiveRow] = field(default_factory=list)
+    rows: list[ProcessRow] = field(default_factory=list)
     robot: RobotNote | None = None
     activity: ActivityNote | None = None
-    results: dict[tuple[str, str], SkillResult] = field(default_factory=dict)  # by object and skill
+    results: list[SkillResult] = field(default_factory=list)  # of all behaviours that ran
     steps: int = 0  # of control, in all
     late_steps: int = 0
 
     @property
-    def restarts(self) -> int:
-        """Number of starts of processes that had ended, in all."""
-        return sum(row.restarts for row in self.rows)
+    def restarts(self) -> dict[str, int]:
+        """Number of times that each process was started again, of those that were."""
+        return {row.name: row.restarts for row in self.rows if row.restarts}
+
+    def list_results(self, what: str, skill: str) -> list[SkillResult]:
+        """Return the results of a skill at an object."""
+        return [one for one in self.results if (one.what, one.skill) == (what, skill)]
 
 
 class Supervisor:
@@ -124,7 +113,7 @@ class Supervisor:
         self._reader: StateReader | None = None
         self._publisher: Any = None
         self._told = -math.inf
-        self._counted = (0, 0)  # steps of the present behaviour that are in the status
+        self._counted = (0, 0, 0)  # steps, late ones and results of the present behaviour that are in it
 
     @property
     def reader(self) -> StateReader:
@@ -180,26 +169,32 @@ class Supervisor:
         self._read(status)
         return status
 
-    def _describe(self, child: Child) -> LiveRow:
-        cpu, source = child.measure_cpu(), SOURCES.get(child.name)
-        age = math.nan if source is None else self.reader.age.get(source, math.inf)
+    def _describe(self, child: Child) -> ProcessRow:
+        cpu, sources = child.measure_cpu(), SOURCES.get(child.name, ())
         if child.is_done:
-            state = "has ended"
+            state = "ended"
         elif not child.pid:
             state = child.describe_end()
         elif child.is_frozen:
             state = "frozen"
         else:
+            age = min((self._ages.get(source, math.inf) for source in sources), default=0.0)
             since = time.monotonic() - child.started
-            silent = not math.isnan(age) and age > min(_SILENT, since)
-            fresh = since < _STARTING and (math.isnan(age) or age > since)
-            state = "running" if not silent else "starting" if fresh else "silent"
-        return LiveRow(child.name, child.pid, state, age, cpu, child.ends)
+            state = "starting" if age > since and since < _STARTING else "running"
+        return ProcessRow(child.name, child.pid, state, child.ends, cpu)
 
-    def _tell(self, rows: Sequence[LiveRow]) -> None:
+    @property
+    def _ages(self) -> dict[str, float]:
+        return {} if self._reader is None else self._reader.age
+
+    @property
+    def is_online(self) -> bool:
+        """Whether the model server answers."""
+        return self._live is not None and self._live.exchange.is_online
+
+    def _tell(self, rows: Sequence[ProcessRow]) -> None:
         if self._publisher is not None and not self._publisher.is_closed:
-            note = SupervisorNote([ProcessRow(r.name, r.pid, r.state, r.restarts, r.cpu) for r in rows])
-            self._publisher.put((), None, encode(note))
+            self._publisher.put((), None, encode(SupervisorNote([*rows])))
 
     def _read(self, status: LiveStatus) -> None:
         reader = self.reader
@@ -207,14 +202,14 @@ class Supervisor:
         status.activity = note = read_note(reader, ACTIVITY, ActivityNote)
         if note is None:
             return
-        steps, late = self._counted
-        if note.steps < steps:  # of another process
-            steps = late = 0
+        steps, late, results = self._counted
+        if note.steps < steps or note.done + note.failed < results:  # of another process
+            steps = late = results = 0
         status.steps += note.steps - steps
         status.late_steps += note.late - late
-        self._counted = note.steps, note.late
-        for one in note.results:
-            status.results[one.what, one.skill] = one
+        news = note.done + note.failed - results
+        status.results += note.results[max(0, len(note.results) - news) :]
+        self._counted = note.steps, note.late, note.done + note.failed
 
     def ask_world(self, do: str, **arguments: Any) -> str:
         """Ask the world for something that people do; return why it was refused, or an empty text."""
