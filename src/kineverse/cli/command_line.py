@@ -66,6 +66,10 @@ COMMANDS: Mapping[str, tuple[str, str]] = MappingProxyType(
         ),
         "track": ("live:TRACK", "estimate the state of a live system from what its robot reads and sees"),
         "behave": ("live:BEHAVE", "let the robot of a live system open and close things, and go on"),
+        "learn": (
+            "live:LEARN",
+            "learn joints that nobody has described in a live system, and doubt known ones",
+        ),
         "keys": ("keys", "make the keys of a model server and its users, for other computers"),
         "relay": ("exchange:RELAY", "relay a site's clients to a model server elsewhere"),
         "ls": ("exchange:LS", "list the model servers of this user"),

@@ -1,4 +1,4 @@
-"""``kineverse world``, ``track`` and ``behave``: processes of a live system around a model server."""
+"""``kineverse world``, ``track``, ``behave``, ``learn``: processes of a live system around a model server."""
 
 from __future__ import annotations
 
@@ -31,6 +31,7 @@ NOISE = "3mm+3mm/m,0.5deg,30Hz"  # noise of the observed poses, unless another o
 WORLDS = ("kinematic", "mujoco")
 STEP = 1e-3  # time step of physics [s]
 _TIME = re.compile(r"\s*([0-9]*\.?[0-9]+)\s*(ms|s|)\s*")
+_WITHOUT_ROUNDS = ("closer", "unknown")  # behaviours
 _SWITCHING = 5e-4  # time for which another thread may hold up a process in real time [s]
 
 _ABOUT = """
@@ -83,9 +84,9 @@ def add_rounds_option(parser: argparse.ArgumentParser) -> None:
 
 def check_task(do: str, far: float, rounds: int) -> None:
     """Check ``--far`` and ``--rounds`` of a behaviour."""
-    if rounds < 1 or (rounds > 1 and do == "closer"):
+    if rounds < 1 or (rounds > 1 and do in _WITHOUT_ROUNDS):
         raise InvalidValueError(
-            f"--rounds {rounds}: a closer has no rounds; --do tour has."
+            f"--rounds {rounds}: '{do}' has no rounds; --do tour has."
             if rounds > 1
             else f"--rounds is a number from 1 on, not {rounds}."
         )
@@ -302,12 +303,12 @@ deviations, and what was never seen or is lost. --noise says what it has to expe
 
 
 def _add_behave_arguments(parser: argparse.ArgumentParser) -> None:
-    from kineverse.live.behaviours import BEHAVIOURS  # for start-up time
+    from kineverse.live.behaviour_process import BEHAVIOURS  # for start-up time
 
     add_live_options(parser)
     parser.add_argument("--do", choices=[*BEHAVIOURS], default="closer", help="the behaviour (closer)")
     parser.add_argument(
-        "--what", nargs="+", metavar="COORDINATE", help="objects by name or pattern ('*_door') (all)"
+        "--what", nargs="+", metavar="NAME", help="objects by name or pattern ('*_door') (all)"
     )
     add_far_option(parser)
     add_rounds_option(parser)
@@ -320,13 +321,14 @@ def _add_behave_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _run_behave(arguments: argparse.Namespace) -> int:
     require("kineverse behave", {"exchange": True, "control": True, "geometry": True}, compiler=True)
-    if arguments.do in ("open", "close") and not arguments.what:
-        raise InvalidValueError(f"--do {arguments.do} is about objects by name: --what COORDINATE.")
+    if arguments.do in ("open", "close", "unknown") and not arguments.what:
+        named = "a part by the name of its frame" if arguments.do == "unknown" else "objects by name"
+        raise InvalidValueError(f"--do {arguments.do} is about {named}: --what NAME.")
     if arguments.seed < 0:
         raise InvalidValueError(f"--seed is a number from 0 on, not {arguments.seed}.")
     check_task(arguments.do, arguments.far, arguments.rounds)
     from kineverse.live import BehaviourProcess  # for start-up time
-    from kineverse.live.behaviours import BEHAVIOURS  # for start-up time
+    from kineverse.live.behaviour_process import BEHAVIOURS  # for start-up time
     from kineverse.planning.bindings import request_planner  # for start-up time
 
     request_planner()
@@ -340,7 +342,7 @@ def _run_behave(arguments: argparse.Namespace) -> int:
                 tell(note)
                 lines.print(note)
 
-            rounds = {} if arguments.do == "closer" else {"rounds": arguments.rounds}
+            rounds = {} if arguments.do in _WITHOUT_ROUNDS else {"rounds": arguments.rounds}
             return BEHAVIOURS[arguments.do](
                 sessions,
                 **rounds,
@@ -393,10 +395,53 @@ BEHAVE = LiveCommand(
     f"""\
 A behaviour: it looks, decides, opens or closes something with the robot, says what it does and why, and goes
 on. 'closer' closes whatever is open, for ever; 'tour' opens and closes each object once, and goes on as
-closer; 'open' and 'close' do that by name, and end, with exit status 0 if all was done. It can be ended and
-started at any time: it looks first, lets go of what the hand may hold, and plans anew.
+closer; 'open' and 'close' do that by name, and end, with exit status 0 if all was done; 'unknown' opens a
+part that no joint moves in the model, and closes it once 'kineverse learn' has written one. It can be ended
+and started at any time: it looks first, lets go of what the hand may hold, and plans anew.
 {_ABOUT}  kineverse behave live:home --do closer
   kineverse behave live:home --do open --what kitchen/fridge_door""",
     _add_behave_arguments,
     _run_behave,
+)
+
+
+# -- learner -------------------------------------------------------------------------------------------------
+
+
+def _add_learn_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("server", metavar="live:NAME", help="address of the model server")
+    parser.add_argument(
+        "--parts",
+        nargs="+",
+        metavar="FRAME",
+        help="parts whose joints are unknown, by name or pattern (all that something with a marker carries)",
+    )
+    parser.add_argument(
+        "--propose", action="store_true", help="replace what the model has only once that is accepted"
+    )
+
+
+def _run_learn(arguments: argparse.Namespace) -> int:
+    require("kineverse learn", {"exchange": True})
+    from kineverse.live import LearnerProcess  # for start-up time
+
+    with handle_interrupts(), live_model(arguments) as live:
+        with explain_twice("learner", arguments.server):
+            learner = LearnerProcess(live, arguments.parts or (), asks=arguments.propose)
+        with closing(learner):
+            announce(f"learner of {arguments.server}")
+            learner.run(on_edit=print_line)
+    return 0
+
+
+LEARN = LiveCommand(
+    f"""\
+The model estimator: it watches the markers that the camera sees. It learns the joint of a part that the model
+holds to be fixed, once that moves, and writes it into the served model. It tests the joints that the model
+has; what does not explain what was seen is replaced after a while, as is the place of furniture. What
+somebody takes back is proposed only. It needs no noise: that is measured.
+{_ABOUT}  kineverse learn live:home
+  kineverse learn live:home --parts kitchen/fridge_door --propose""",
+    _add_learn_arguments,
+    _run_learn,
 )

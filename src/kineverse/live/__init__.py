@@ -13,9 +13,11 @@ if TYPE_CHECKING:
         OpenByName as OpenByName,
         Tour as Tour,
     )
+    from .learner_process import LearnerProcess as LearnerProcess
     from .live_page import LivePage as LivePage
     from .live_robot import LiveBelief as LiveBelief, LiveRobot as LiveRobot
     from .tracker_process import TrackerProcess as TrackerProcess
+    from .unknown_behaviour import OpenUnknown as OpenUnknown, make_unknown_scene as make_unknown_scene
     from .world_process import WorldProcess as WorldProcess
 
 lazy_face(__name__)

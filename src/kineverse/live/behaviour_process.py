@@ -4,16 +4,21 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 
 from kineverse.exchange import LiveModel
 from kineverse.manipulation import Session, SkillError
 
-from .behaviours import Behaviour, Look
+from .behaviours import Behaviour, CloseByName, Closer, Look, OpenByName, Tour
 from .live_robot import LiveBelief, LiveRobot
 from .streams import ACTIVITY, TICK, ActivityNote, encode
+from .unknown_behaviour import OpenUnknown
 
+BEHAVIOURS: Mapping[str, Callable[..., Behaviour]] = {
+    one.name: one for one in (Closer, Tour, OpenByName, CloseByName, OpenUnknown)
+}
+"""Behaviours by name."""
 _BEAT = 0.3  # time after which what is done is told again, as while a plan is made [s]
 
 

@@ -32,6 +32,7 @@ from kineverse.manipulation.opening.approach_planner import Opener
 from kineverse.manipulation.opening.hand_motion import HandMotion
 from kineverse.manipulation.skill_run import choose_tolerance
 from kineverse.model.model_view import ModelView
+from kineverse.worlds.furniture_overlaps import OVERLAP
 
 from .streams import ActivityNote, SkillResult
 
@@ -125,6 +126,7 @@ class Behaviour:
     """
 
     name = ""
+    overlap = OVERLAP  # depth from which on what an object meets on its way is in its way [m]
     heeds_edits = True  # whether an edit of the model ends a skill
 
     def __init__(
@@ -230,7 +232,7 @@ class Behaviour:
             else:
                 outcome = open_object(
                     session, coordinate, target=task.target, hand=self.scene.gripper,
-                    seconds=self._seconds, seed=self.seed + tries,
+                    seconds=self._seconds, overlap=self.overlap, seed=self.seed + tries,
                 )  # fmt: skip
         except KineverseError as error:
             value, name = float(session.state[coordinate]), session.interface.name
@@ -565,9 +567,3 @@ class Tour(Agenda):
         """Go on as a closer."""
         self.name = Closer.name
         return Closer.choose(self, session)
-
-
-BEHAVIOURS: Mapping[str, Callable[..., Behaviour]] = {
-    one.name: one for one in (Closer, Tour, OpenByName, CloseByName)
-}
-"""Behaviours by name."""

@@ -52,15 +52,22 @@ class LearnerProcess:
         self._thread = threading.Thread(target=self._work, name="kineverse-learn", daemon=True)
         self._thread.start()
 
-    def run(self, is_over: Callable[[], bool] = lambda: False) -> None:
-        """Learn until it is over."""
-        told = 0.0
+    def run(
+        self,
+        is_over: Callable[[], bool] = lambda: False,
+        *,
+        on_edit: Callable[[str], object] = lambda _: None,
+    ) -> None:
+        """Learn until it is over; each edit, and why there was none, is told to a function."""
+        told, last = 0.0, ""
         while not is_over():
             self._reader.wait(_NEWS)
             self.take()
             if (now := time.monotonic()) - told >= _NEWS:
                 told = now
                 self.tell()
+                if self._note.last != last:
+                    on_edit(last := self._note.last)
 
     def take(self) -> bool:
         """Take the newest picture, and return whether there was one."""

@@ -13,14 +13,14 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from kineverse.articulations import Joint, Prismatic, Revolute
+from kineverse.articulations import Fixed, Prismatic, Revolute
 from kineverse.errors import KineverseError
 from kineverse.estimation import Fit, PlausibilityMonitor, pose_covariance
 from kineverse.estimation.plausibility.report import TestableJoint, find_testable_joints
 from kineverse.geometry.objects import matches_pattern
 from kineverse.grasping.finger_branches import path_to_root
 from kineverse.lie import Array, exp_so3, inverse, pose_difference, transform, translation, unit_vector
-from kineverse.manipulation.unknown_objects.joint_learning import JointLearning
+from kineverse.manipulation.unknown_objects.joint_learning import JointLearning, axis_deviation
 from kineverse.manipulation.unknown_objects.unmodelled_joint import JointPath, align_fit
 from kineverse.model.basic_operations import Attach, Override
 from kineverse.model.body import Pose
@@ -98,6 +98,11 @@ class Proposal:
         return True
 
 
+def _added_tag(frame: str) -> str:
+    """Return the tag of a joint that is put on top of whatever has placed a frame."""
+    return f"learned {frame}"
+
+
 def _served(model: Model, tag: str) -> Operation | None:
     return model.history.operation(tag) if tag in model.history.entries else None
 
@@ -121,6 +126,17 @@ class _Part:
     turn: float = 0.0
     written: Fit | None = None
     wrote: float = -math.inf
+
+    @property
+    def distance(self) -> float:
+        """Motion of the part [m], its turn about an axis that may be anywhere included."""
+        return max(self.way, _ARM * self.turn)
+
+    @property
+    def is_of_interest(self) -> bool:
+        """Whether something can be said of the part, or it was asked for."""
+        has_moved = self.learning.poses >= _FEWEST and self.distance > _MOVED
+        return self.is_named or self.written is not None or has_moved
 
 
 @dataclass(eq=False)
@@ -173,7 +189,9 @@ class ModelEstimator:
         self._furniture: dict[str, Array] = {}  # served poses of what stands in the world
         self._turn = 0
         self._now = -math.inf
-        self._written: dict[str, Proposal] = {}
+        self._written: dict[
+            str, tuple[Operation | None, Operation | None]
+        ] = {}  # before, and as it is served
         self._taken_back: set[str] = set()
         self._accepted: set[str] = set()
         self._refused: dict[str, float] = {}
@@ -250,25 +268,24 @@ class ModelEstimator:
         ):
             pose = self._relate(part.parent) @ tracks.smoothed(part.frame)
             part.way, part.turn = measure_way(part.start, pose, np.zeros(3))
-        distance = max(part.way, _ARM * part.turn)
         if part.learning.poses < _FEWEST or now - part.fitted < _PERIOD:
             return
         part.fitted = now
-        if not part.learning.update(distance, part.turn, now) or part.start is None:
+        if not part.learning.update(part.distance, part.turn, now) or part.start is None:
             return
         learned = part.learning.learned
         assert learned is not None
         fit, written = learned.fit, part.written
         if written is not None and fit.family == written.family:
-            if _deviation(fit) > _BETTER * _deviation(written) or _deviation(written) < _EXACT:
+            if axis_deviation(fit) > _BETTER * axis_deviation(written) or axis_deviation(written) < _EXACT:
                 return
         ahead = np.asarray(fit.motion.linearise(fit.joint_values[-1:]).pose[0])
         fit = align_fit(fit, part.zero, ahead)
         operation = fit.operation(part.name, part.parent, part.frame, limits=False)
         words = f"'{part.frame}' is {fit.family} on '{part.parent}', {fit.probability:.0%}"
-        words += f", known to {1e3 * _deviation(fit):.0f} mm"
+        words += f", known to {1e3 * axis_deviation(fit):.0f} mm"
         before = _served(self.model, part.tag)
-        if before is None or isinstance(before, Override):
+        if part.tag == _added_tag(part.frame):
             operation = Override(operation)
         self._propose(Proposal(part.tag, operation, before, words, part.frame, now, fit))
 
@@ -323,7 +340,9 @@ class ModelEstimator:
         words = f"'{known.joint.child}' is {verdict.result} on '{known.joint.parent}'"
         known.why = f"'{known.joint.child}' does not move as the model says"
         operation = verdict.replacement
-        if getattr(operation, "kind", "") != getattr(known.served, "kind", ""):
+        records = self.model.articulations.values()
+        kind = next((record.kind for record in records if record.child == known.joint.frame), "")
+        if getattr(operation, "kind", kind) != kind:
             operation = self._begin_at_zero(known, operation)
         self._propose(Proposal(tag, operation, known.served, words, known.joint.child, now))
 
@@ -379,16 +398,18 @@ class ModelEstimator:
                 self._propose(self._place(frame, words))
 
     def _place(self, frame: str, words: str) -> Proposal:
-        model, tag = self.model, self._writer(frame)
-        served, parent = model.history.operation(tag), model.frames[frame].parent
-        pose = inverse(np.asarray(model.fk(parent)({}))) @ self.tracks.smoothed(frame)
-        if isinstance(served, Joint) and served.parent == parent:  # type: ignore[attr-defined]
-            operation: Operation = replace(served, origin=Pose.from_matrix(pose))
-            return Proposal(tag, operation, served, words, frame, self._now)
-        operation = Attach(frame, Frame(parent, (Pose.from_matrix(pose),)))
-        if isinstance(served, Attach):
-            return Proposal(tag, operation, served, words, frame, self._now)
-        return Proposal(f"seen {frame}", operation, None, words, frame, self._now)
+        model, tag, parent = self.model, self._writer(frame), self.model.frames[frame].parent
+        pose = Pose.from_matrix(inverse(np.asarray(model.fk(parent)({}))) @ self.tracks.smoothed(frame))
+        for name, record in model.articulations.items():
+            own = ("articulations", name) in model.history.entry(tag).writes
+            if own and record.child == frame and record.kind == "fixed":
+                operation: Operation = Fixed(
+                    name=name, parent=record.parent, child=frame, origin=pose, dynamics=record.dynamics
+                )
+                break
+        else:
+            tag, operation = f"seen {frame}", Attach(frame, Frame(parent, (pose,)))
+        return Proposal(tag, operation, _served(model, tag), words, frame, self._now)
 
     # -- the model -------------------------------------------------------------------------------------------
 
@@ -399,11 +420,11 @@ class ModelEstimator:
         """Find what is to be watched in the present model, and see what became of what was written."""
         model = self.model
         self._version, self._frames = model.version, len(self.tracks.names)
-        for tag, proposal in list(self._written.items()):
+        for tag, (before, after) in list(self._written.items()):
             now = _served(model, tag)
-            if now != proposal.operation:
+            if now != after:
                 del self._written[tag]
-                if now == proposal.before:
+                if now == before:
                     self._taken_back.add(tag)
         self.proposals = {t: p for t, p in self.proposals.items() if _served(model, t) == p.before}
         names = [name for name in self.tracks.names if name in model.frames]
@@ -452,7 +473,7 @@ class ModelEstimator:
             return None
         name, tag = next(iter(records), f"{frame}/joint"), self._writer(frame)
         if ("articulations", name) not in model.history.entry(tag).writes:
-            tag = f"learned {frame}"
+            tag = _added_tag(frame)
         if before is not None and (before.parent, before.tag) == (parent, tag):
             before.written = None
             return before
@@ -498,8 +519,8 @@ class ModelEstimator:
     def confirm(self, proposal: Proposal) -> None:
         """Take note that a proposal was written into the model."""
         tag = proposal.tag
-        before = self._written[tag].before if tag in self._written else proposal.before
-        self._written[tag] = replace(proposal, before=before)
+        before, _ = self._written.get(tag, (proposal.before, None))
+        self._written[tag] = before, _served(self.model, tag)
         self._taken_back.discard(tag)
         self._accepted.discard(tag)
         self.proposals.pop(tag, None)
@@ -521,9 +542,7 @@ class ModelEstimator:
     def note(self, problem: str = "", waits: str = "") -> LearnerNote:
         """Return what is thought now; ``waits`` is why due proposals wait."""
         rows = [ProposalRow(p.tag, p.what, self._explain_wait(p) or waits) for p in self.proposals.values()]
-        watched = [
-            self._describe(p) for p in self._parts.values() if p.is_named or p.learning.poses >= _FEWEST
-        ]
+        watched = [self._describe(part) for part in self._parts.values() if part.is_of_interest]
         return LearnerNote(watched, dict(self.alarms), rows, self.edits, self.last, problem)
 
     def _describe(self, part: _Part) -> WatchedPart:
@@ -543,12 +562,3 @@ class ModelEstimator:
         return WatchedPart(
             part.frame, part.parent, state, family, probability, part.way, part.turn, learning.poses
         )
-
-
-def _deviation(fit: Fit) -> float:
-    """Return the standard deviation of an axis [m], that of its direction at the length of an arm."""
-    variance = 0.0
-    for k, name in enumerate(fit.coordinates):
-        if name.startswith(("axis", "point")):
-            variance += fit.covariance[k, k] * (_ARM**2 if name.startswith("axis") else 1.0)
-    return math.sqrt(variance)

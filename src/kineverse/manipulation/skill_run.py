@@ -14,6 +14,7 @@ from kineverse.model.model_view import ModelView
 from kineverse.state import State
 from kineverse.symbols import Symbol
 from kineverse.worlds import Robot
+from kineverse.worlds.furniture_overlaps import OVERLAP
 
 from .outcome import Outcome, SkillError
 from .session import Session
@@ -56,6 +57,8 @@ class SkillRun:
         self.until = self.begin + seconds
         self.measures: dict[str, Any] = {}
 
+    overlap = OVERLAP  # depth from which on what the object meets on its way is in its way [m]
+
     @property
     def value(self) -> float:
         """Believed value of the object's coordinate [m], [rad]; NaN without one."""
@@ -76,8 +79,9 @@ class SkillRun:
         session, coordinate = self.session, self.coordinate
         assert coordinate is not None
         obstacle = find_obstacle(
-            self.model, coordinate, session.state, target, robot=self.robot, start=session.start
-        )
+            self.model, coordinate, session.state, target, robot=self.robot, start=session.start,
+            least=self.overlap,
+        )  # fmt: skip
         if obstacle is not None:
             raise BlockedError(obstacle)
 

@@ -24,6 +24,7 @@ from kineverse.manipulation.skill_run import (
     find_object_coordinate,
 )
 from kineverse.symbols import Symbol
+from kineverse.worlds.furniture_overlaps import OVERLAP
 
 from .approach_planner import Approach, Opener
 from .base_placement import BasePlacement
@@ -49,6 +50,7 @@ def open_object(
     handle: Handle | str | None = None,
     seconds: float = 180.0,
     tolerance: float | None = None,
+    overlap: float = OVERLAP,
     placements: int = 600,
     seed: int = 0,
 ) -> Outcome:
@@ -81,6 +83,8 @@ def open_object(
     tolerance
         Largest distance from the target [m], [rad]; by default 2 % of the distance, and 20 mm at a limit, see
         :func:`.choose_tolerance`.
+    overlap
+        Depth from which on something is in the way of the object [m]: more where a joint is not known well.
     placements
         Largest number of sampled bases for one grasp.
     seed
@@ -109,6 +113,7 @@ def open_object(
     gripper = hand if isinstance(hand, Gripper) else session.robot.gripper(hand)
     opener = Opener.of(session.robot, gripper, session.state)
     run = OpeningRun(session, opener, handle, target, tolerance, seconds, placements, seed)
+    run.overlap = as_positive(overlap, "overlap=")
     return run.perform(run.open)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import threading
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,6 +23,18 @@ _LOOKS = 3  # results in a row that a decision takes
 _EVERY = 4  # number of new poses between two results
 _VISIBLE = 0.005  # motion of the part before which no joint is fitted [m]
 LEAST_DISTANCE, LEAST_TURN = 0.03, math.radians(4.0)  # before, noise alone looks like any joint [m], [rad]
+
+
+_ARM = 0.3  # length of a lever at which the direction of an axis counts [m]
+
+
+def axis_deviation(fit: Fit) -> float:
+    """Return the standard deviation of an axis [m], of its place and of its direction at a short lever."""
+    variance = 0.0
+    for k, name in enumerate(fit.coordinates):
+        if name.startswith(("axis", "point")):
+            variance += fit.covariance[k, k] * (_ARM**2 if name.startswith("axis") else 1.0)
+    return math.sqrt(variance)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -47,29 +60,39 @@ class JointLearning:
         self.learned: LearnedJoint | None = None
         self.likely: Fit | None = None
         self._family, self._looks, self._evaluated = "", 0, 0
+        self._thread: threading.Thread | None = None
+        self._waiting: list[tuple[Array, Array | None]] = []
 
     @property
     def poses(self) -> int:
         """Number of poses so far."""
-        return len(self._identifier)
+        return len(self._identifier) + len(self._waiting)
 
     def add(self, pose: Array, covariance: Array | None = None) -> None:
         """Add a pose (4, 4) of the part relative to what it moves in.
 
         All poses have a covariance (6, 6), or none has, and the noise is estimated.
         """
-        self._identifier.add(None, pose, child_covariance=covariance)
+        self._waiting.append((pose, covariance))
+
+    def update_beside(self, distance: float, turn: float, time: float) -> None:
+        """Do :meth:`update` in a thread of its own, unless one is under way: no command waits for it."""
+        if self._thread is None or not self._thread.is_alive():
+            self._thread = threading.Thread(target=self.update, args=(distance, turn, time), daemon=True)
+            self._thread.start()
 
     def update(self, distance: float, turn: float, time: float) -> bool:
         """Return True if there is a new result of a decided family."""
-        self.likely = None
         if self.poses < self._evaluated + _EVERY or distance < _VISIBLE:
+            self.likely = None
             return False
-        self._evaluated = self.poses
+        waiting, self._waiting = self._waiting, []
+        for pose, covariance in waiting:
+            self._identifier.add(None, pose, child_covariance=covariance)
+        self._evaluated = len(self._identifier)
         result = self._identifier.result
         fit = result.best
-        if fit.joint_values.shape[1] == 1 and fit.is_determined:
-            self.likely = fit
+        self.likely = fit if fit.joint_values.shape[1] == 1 and fit.is_determined else None
         if distance < LEAST_DISTANCE and turn < LEAST_TURN:
             return False
         certain = fit.probability >= CERTAIN and not result.is_ambiguous and fit.joint_values.shape[1] == 1

@@ -68,7 +68,7 @@ class PartBelief:
     and looks that are far from it are outliers.
 
     ``looks`` has the others since the part was held: poses (4, 4) relative to what it moves in, and the
-    covariances (6, 6) of their errors.
+    covariances (6, 6) of their errors; None if the noise is not stated.
     """
 
     def __init__(
@@ -79,9 +79,10 @@ class PartBelief:
         hand: str,
         markers: Sequence[str],
         ancestors: Sequence[str],
-        sensors: Sensors,
+        sensors: Sensors | None,
     ) -> None:
         model = unknown.model
+        self._is_stated, sensors = sensors is not None, sensors or Sensors()
         self.unknown, self.sensors = unknown, sensors
         self.monitor: PlausibilityMonitor | None = None
         self.seen: dict[str, None] = {}
@@ -94,7 +95,7 @@ class PartBelief:
         self._before = self._world_T_parent @ unknown.origin
         self.held: PoseMean | None = None
         self.still = PoseMean(_STATIC_LOOKS)
-        self.looks: list[tuple[Array, Array]] = []
+        self.looks: list[tuple[Array, Array | None]] = []
         self.path: JointPath | None = None
         self._references = {name: PoseMean(_STATIC_LOOKS) for name in ancestors}
         self._beside: str | None = None
@@ -216,7 +217,7 @@ class PartBelief:
         elif self.held.add(inverse(frame) @ pose):
             relative = inverse(self.reference_pose)
             turn = np.kron(np.eye(2), relative[:3, :3])
-            self.looks.append((relative @ pose, turn @ covariance @ turn.T))
+            self.looks.append((relative @ pose, turn @ covariance @ turn.T if self._is_stated else None))
 
     def _covariance(self, world_T_marker: Array, world_T_part: Array) -> Array:
         """Return the covariance (6, 6) of an observed pose of the part in the world."""

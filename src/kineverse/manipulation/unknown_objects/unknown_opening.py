@@ -12,6 +12,7 @@ import numpy as np
 from kineverse._checks import as_count, as_positive
 from kineverse.control import Command
 from kineverse.errors import InvalidValueError, KineverseError, UnknownNameError, suggest
+from kineverse.estimation import Fit
 from kineverse.grasping import Grasp, Gripper, sample_grasps
 from kineverse.grasping.finger_branches import path_to_root
 from kineverse.grasping.graspable_features import find_parts
@@ -29,7 +30,7 @@ from kineverse.state import State
 from kineverse.worlds import Robot, Sensors
 from kineverse.worlds.run_metrics import measure_way
 
-from .joint_learning import JointLearning, revise_joint, watch_joint
+from .joint_learning import JointLearning, axis_deviation, revise_joint, watch_joint
 from .part_belief import PartBelief
 from .pulling_policy import LearnedPull, StraightPull, learn_model, point_speed
 from .unmodelled_joint import JointPath, UnknownPart, find_joint, free_part
@@ -53,6 +54,7 @@ _DIRECTIONS = (
 """Directions in which a part is pulled one after the other until it follows, in the axes of its handle: along
 its outward normal, to both sides across the bar, and to both ends along it."""
 _REFIT = 0.5  # time between two controllers for a learned joint [s]
+_BETTER = 0.5  # share of the deviation of a joint that a better one has at most
 _FOLLOWS, _STALLED, _PATIENCE = 0.01, 0.004, 1.5
 """Motion of a part that follows the hand, and its least progress [m] in a time [s]."""
 _LED = 0.06  # distance of the handle before which the hand does not rely on a joint that was learned [m]
@@ -101,7 +103,7 @@ def open_unknown(
         and stands still, or the world as the robot's odometry has it.
     sensors
         Stated noise of the observations; by default that of the session's belief if it is a
-        :class:`.TrackedBelief`, else exact.
+        :class:`.TrackedBelief`, else the noise is estimated.
     way, turn
         Wanted opening: distance of the handle of a part that slides [m], angle of one that turns [rad].
     hand
@@ -149,7 +151,7 @@ def open_unknown(
             f"The handle '{handle}' is not below the part '{part}', but {', '.join(above)}."
         )
     if sensors is None:
-        sensors = session.belief.sensors if isinstance(session.belief, TrackedBelief) else Sensors()
+        sensors = session.belief.sensors if isinstance(session.belief, TrackedBelief) else None
     with suppress(SkillError):  # which the run says
         session.refresh()  # a robot's time runs on between two skills
     before = model.default_state()
@@ -193,6 +195,9 @@ class UnknownOpeningRun(SkillRun):
         self.point, self.frame_T_handle = belief.unknown.point, belief.unknown.frame_T_handle
         self.wanted, self.samples, self.seed = wanted, samples, seed
         self.learning = JointLearning()
+        # Time runs on in a world that is not simulated in lock step.
+        self._is_late = not hasattr(session.interface, "reset")
+        self._update = self.learning.update_beside if self._is_late else self.learning.update
         self.opener: Opener
         self.motion: HandMotion
         self.start: Array | None = None  # pose (4, 4) of the part when it was grasped first
@@ -435,6 +440,7 @@ class UnknownOpeningRun(SkillRun):
             self.start = belief.relative_pose
         belief.begin_motion()
         pull: StraightPull | LearnedPull = StraightPull(motion, belief, bar_T_hand, self._direction)
+        held: Fit | None = None
         fitted, best = -math.inf, self.opening[0]
         idle = 0.0  # time without progress, but for that in which the robot waits [s]
         while True:
@@ -444,10 +450,11 @@ class UnknownOpeningRun(SkillRun):
             distance, turn = self.opening
             now = self.session.time
             with session.timed("learn"):
-                learning.update(distance, turn, now - self._first_pull)
+                self._update(distance, turn, now - self._first_pull)
                 learned = learning.learned
-                if learned is not None and now - fitted >= _REFIT and distance >= _LED:
-                    fit, fitted = learned.fit, now
+                due = learned is not None and now - fitted >= _REFIT and distance >= _LED
+                if learned is not None and due and self._is_worth(learned.fit, held):
+                    held, fit, fitted = learned.fit, learned.fit, now
                     pull = LearnedPull(
                         motion, belief, learn_model(self.model, belief, fit), bar_T_hand, self.start,
                         self.wanted[fit.motion.kinds[0]],
@@ -480,6 +487,10 @@ class UnknownOpeningRun(SkillRun):
                     pull = StraightPull(motion, belief, bar_T_hand, self._direction)
                     continue
                 return self._explain_stall(pull, command, part_T_hand)
+
+    def _is_worth(self, fit: Fit, held: Fit | None) -> bool:
+        """Return whether a joint is worth a new controller: where time runs on, only if it is much better."""
+        return not self._is_late or held is None or axis_deviation(fit) < _BETTER * axis_deviation(held)
 
     def _explain_stall(
         self, pull: StraightPull | LearnedPull, command: Command, part_T_hand: Array

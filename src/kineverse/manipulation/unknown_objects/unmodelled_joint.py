@@ -160,7 +160,7 @@ def write_joint(model: Model, frame: str, fit: Fit, parent: str) -> Symbol:
 
 
 def align_fit(fit: Fit, zero: Array, ahead: Array) -> Fit:
-    """Return an identified joint whose value is 0 where its part is nearest to a pose (4, 4), and positive ahead.
+    """Return an identified joint with the value 0 at the nearest place to a pose (4, 4), and positive ahead.
 
     Identified values are about their mean. With this zero, a part that was shut is shut at 0 in each new fit.
     A curve, and a joint of several coordinates, stays as it is.
