@@ -80,7 +80,7 @@ _ADDRESS = re.compile(r"https?://\S+")
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    from kineverse.live.behaviours import BEHAVIOURS  # for start-up time
+    from kineverse.live.behaviour_process import BEHAVIOURS  # for start-up time
 
     parser.add_argument("kitchen", metavar="KITCHEN", nargs="?", default=KITCHEN, help=f"a model ({KITCHEN})")
     parser.add_argument(
@@ -507,8 +507,6 @@ class Screen:
         lines = [f"{SCHEME}{self._system.name}   {self._address}".rstrip()]
         lines += self._list_processes(status, width)
         lines += [join_lines(line) for line in describe_all(supervisor.reader)]
-        if status.activity is not None and status.activity.phase:
-            lines.append(f"phase: {join_lines(status.activity.phase)}")
         lines.append(self._answer or _KEYS)
         up = f"\033[{self._height}A" if self._height else ""
         text = "".join(f"\033[2K{shorten_text(line, width)}\n" for line in lines)

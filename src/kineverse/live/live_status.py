@@ -25,14 +25,13 @@ from .streams import (
     TrackerNote,
     read_note,
 )
-from .supervisor import BEHAVE, SERVER, TRACK, WORLD
 
-PUBLISHED: Final[Mapping[str, tuple[str, ...]]] = {
-    WORLD: (ROBOT, CAMERA, TRUTH),
-    TRACK: (TRACKER,),
-    BEHAVE: (ACTIVITY, COMMANDS),
-    "learner": (LEARNER,),
-    "supervisor": (SUPERVISOR,),
+SOURCES: Final[Mapping[str, tuple[str, ...]]] = {
+    "world": (ROBOT, CAMERA, TRUTH),
+    "track": (TRACKER,),
+    "learn": (LEARNER,),
+    "behave": (ACTIVITY, COMMANDS),
+    "live": (SUPERVISOR,),
 }
 """Sources by the process that publishes them."""
 
@@ -44,6 +43,7 @@ PATIENCE: Final[Mapping[str, float]] = {
 A camera that sees nothing, and a robot that nobody moves, are silent rightly.
 """
 
+SERVER: Final = "serve"
 _UNSEEN = 3.0  # time for which a coordinate may be unseen before it is said [s]
 _MOST_NAMES, _MOST_RESULTS = 3, 3
 
@@ -84,8 +84,8 @@ def list_processes(
     """
     rows = {} if supervisor is None else {row.name: row for row in supervisor.rows}
     found = []
-    for name in dict.fromkeys((SERVER, *rows, *PUBLISHED)):
-        sources = [source for source in PUBLISHED.get(name, ()) if source in ages or source in known]
+    for name in dict.fromkeys((SERVER, *rows, *SOURCES)):
+        sources = [source for source in SOURCES.get(name, ()) if source in ages or source in known]
         if name == SERVER and not is_online:
             found.append(ProcessStatus(name, "gone", "", "", "", False))
         elif name in rows or sources:

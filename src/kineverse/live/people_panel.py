@@ -40,6 +40,7 @@ class Choices:
     )  # limits of furniture's coordinates
     units: Mapping[str, str] = field(default_factory=dict)
     carried: Mapping[str, Sequence[str]] = field(default_factory=dict)  # frames by the coordinate
+    frames: Sequence[str] = ()  # all that are not the robot's
     places: Mapping[str, Place] = field(default_factory=dict)
 
     @classmethod
@@ -53,6 +54,7 @@ class Choices:
             {str(s): choose_slider_range(model.limits(s), values[str(s)], "") for s in free},
             infer_units(model, values, names),
             {str(s): find_carried(model, s) for s in free},
+            [name for name in model.frames if name not in owned],
             {name: Place(model, name) for name in list_furniture(model, owned)},
         )
 
@@ -200,9 +202,8 @@ class PeoplePanel:
             self._ask_world("noise", f"noise: {name}", text=NOISES[name])
 
     def _hide(self, name: str) -> None:
-        carried = self._choices.carried
-        everything = sorted({frame for frames in carried.values() for frame in frames})
-        frames = everything if name == _ALL else list(carried.get(name, ()))
+        choices = self._choices
+        frames = [*choices.frames] if name == _ALL else [*choices.carried.get(name, ())]
         self._ask_world("hide", f"hidden: {name}" if frames else "nothing is hidden", frames=frames)
 
     def _cut(self, freeze: bool) -> None:
