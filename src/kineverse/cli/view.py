@@ -61,7 +61,7 @@ examples:
   kineverse view                                 list of all models and articulations
   kineverse view my_robot.urdf --set elbow=45deg --port 8090
   kineverse view kitchen --robot fetch@0.45,0.7,90deg
-  kineverse view live:home                       follows the edits of a model that is served
+  kineverse view live:home                       a model that is served: its edits, and what moves there
   kineverse view kitchen --near 5cm              bodies within 5 cm of each other
   kineverse view articulations/ratchet --near 0.1 --collisions --picture ratchet.png
   kineverse view examples/arm.urdf --play arm.json   a trajectory of kineverse plan --save arm.json

@@ -1,4 +1,4 @@
-"""What people read of a live system: its processes with the age of their news, and what is done and why."""
+"""Text about a live system for people: its processes and the age of their news, and what is done and why."""
 
 from __future__ import annotations
 
@@ -71,16 +71,8 @@ def list_processes(
 ) -> list[ProcessStatus]:
     """Return the processes of a live system.
 
-    Parameters
-    ----------
-    ages
-        Time since the newest vector of each source that is there [s].
-    supervisor
-        What the supervisor says; None without any.
-    known
-        Sources that were there before; those that are there no longer are gone.
-    is_online
-        Whether the model server answers.
+    They are told by the ages of the sources that are there [s], and by the supervisor, if there is one. Of
+    the known sources, those that are there no longer are gone. The model server is online if it answers.
     """
     rows = {} if supervisor is None else {row.name: row for row in supervisor.rows}
     found = []

@@ -33,7 +33,7 @@ _ALL = "all"
 
 @dataclass(frozen=True)
 class Choices:
-    """What there is to choose from in a version of a model."""
+    """Things to choose from in a version of a model."""
 
     moved: Mapping[str, tuple[float, float]] = field(
         default_factory=dict
@@ -60,17 +60,7 @@ class Choices:
 
 
 class PeoplePanel:
-    """Controls by which people move things, hide markers, add noise, cut processes, and accept proposals.
-
-    Parameters
-    ----------
-    gui
-        Controls of the page.
-    live
-        The served model.
-    reader
-        Reader of its streams.
-    """
+    """Controls by which people move things, hide markers, add noise, cut processes, and accept proposals."""
 
     def __init__(self, gui: Any, live: LiveModel, reader: StateReader) -> None:
         self._gui, self._live, self._reader = gui, live, reader
