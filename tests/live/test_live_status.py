@@ -36,21 +36,21 @@ def states(*arguments, **options):
 
 
 def test_what_is_gone_or_frozen_is_named():
-    assert states(FRESH) == dict.fromkeys(("world", "tracker", "behaviour"), ("running", True))
-    assert states(FRESH | {"tracker": 4.4})["tracker"] == ("frozen for 4 s", False)
+    assert states(FRESH) == dict.fromkeys(("world", "track", "behave"), ("running", True))
+    assert states(FRESH | {"tracker": 4.4})["track"] == ("frozen for 4 s", False)
     gone = {source: age for source, age in FRESH.items() if source != "tracker"}
-    assert "tracker" not in states(gone)  # it never was there
-    assert states(gone, known=FRESH)["tracker"] == ("gone", False)
-    assert states(FRESH, is_online=False)["server"] == ("gone", False)
-    assert "server" not in states(FRESH)
+    assert "track" not in states(gone)  # it never was there
+    assert states(gone, known=FRESH)["track"] == ("gone", False)
+    assert states(FRESH, is_online=False)["serve"] == ("gone", False)
+    assert "serve" not in states(FRESH)
 
 
 def test_the_word_of_the_supervisor_counts_unless_the_news_are_old():
-    note = SupervisorNote([ProcessRow("tracker", 7, "starting", 3, 0.25), ProcessRow("page", 8, "running")])
+    note = SupervisorNote([ProcessRow("track", 7, "starting", 3, 0.25), ProcessRow("view", 8, "running")])
     rows = {row.name: row for row in list_processes(FRESH | {"tracker": 5.0}, note)}
-    assert rows["tracker"][:4] == ("tracker", "starting", "25%", "4")
-    assert not rows["tracker"].is_well
-    assert rows["page"][:5] == ("page", "running", "", "1", "")
+    assert rows["track"][:4] == ("track", "starting", "25%", "4")
+    assert not rows["track"].is_well
+    assert rows["view"][:5] == ("view", "running", "", "1", "")
     assert rows["world"].news == "robot 10 ms, camera 7 s, truth 30 ms"
 
 

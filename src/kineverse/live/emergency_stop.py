@@ -28,7 +28,7 @@ STOP_PATH, RELEASE_PATH, STATE_PATH = "/robot/stop", "/robot/release", "/robot/s
 
 
 class RobotState(msgspec.Struct):
-    """What the button shows."""
+    """State of the robot, for the button."""
 
     robot: bool  # whether there is one at all
     stopped: str = ""  # why it takes no commands; empty if it does
@@ -38,15 +38,8 @@ class RobotState(msgspec.Struct):
 class EmergencyStop:
     """Emergency stop of the robot of a live system, for any number of browsers.
 
-    Parameters
-    ----------
-    reader
-        Reader of the streams. It reaches the world without the model server.
-
-    Attributes
-    ----------
-    wanted
-        Whether a stop was asked for that nobody has released.
+    The reader of the streams reaches the world without the model server. A stop is ``wanted`` until somebody
+    releases it.
     """
 
     def __init__(self, reader: StateReader) -> None:
@@ -86,7 +79,7 @@ class EmergencyStop:
 
     @property
     def state(self) -> RobotState:
-        """What is to be shown."""
+        """The state of the robot, which the button shows."""
         note, age = self._read()
         if note is None:
             return RobotState(self.wanted, problem="No robot is there." if self.wanted else "")

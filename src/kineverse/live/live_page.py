@@ -54,7 +54,7 @@ _DOUBLES = np.dtype(float).itemsize
 
 @dataclass
 class StreamWorld:
-    """What the streams tell of the true world, for :class:`.LiveRun`."""
+    """True world as far as streams tell of it, for :class:`.LiveRun`."""
 
     state: Mapping[str, float] = field(default_factory=dict)
 

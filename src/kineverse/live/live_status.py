@@ -1,4 +1,4 @@
-"""What people read of a live system: its processes with the age of their news, and what is done and why."""
+"""Text about a live system for people: its processes and the age of their news, and what is done and why."""
 
 from __future__ import annotations
 
@@ -25,14 +25,13 @@ from .streams import (
     TrackerNote,
     read_note,
 )
-from .supervisor import BEHAVE, SERVER, TRACK, WORLD
 
-PUBLISHED: Final[Mapping[str, tuple[str, ...]]] = {
-    WORLD: (ROBOT, CAMERA, TRUTH),
-    TRACK: (TRACKER,),
-    BEHAVE: (ACTIVITY, COMMANDS),
-    "learner": (LEARNER,),
-    "supervisor": (SUPERVISOR,),
+SOURCES: Final[Mapping[str, tuple[str, ...]]] = {
+    "world": (ROBOT, CAMERA, TRUTH),
+    "track": (TRACKER,),
+    "learn": (LEARNER,),
+    "behave": (ACTIVITY, COMMANDS),
+    "live": (SUPERVISOR,),
 }
 """Sources by the process that publishes them."""
 
@@ -44,6 +43,7 @@ PATIENCE: Final[Mapping[str, float]] = {
 A camera that sees nothing, and a robot that nobody moves, are silent rightly.
 """
 
+SERVER: Final = "serve"
 _UNSEEN = 3.0  # time for which a coordinate may be unseen before it is said [s]
 _MOST_NAMES, _MOST_RESULTS = 3, 3
 
@@ -71,21 +71,13 @@ def list_processes(
 ) -> list[ProcessStatus]:
     """Return the processes of a live system.
 
-    Parameters
-    ----------
-    ages
-        Time since the newest vector of each source that is there [s].
-    supervisor
-        What the supervisor says; None without any.
-    known
-        Sources that were there before; those that are there no longer are gone.
-    is_online
-        Whether the model server answers.
+    They are told by the ages of the sources that are there [s], and by the supervisor, if there is one. Of
+    the known sources, those that are there no longer are gone. The model server is online if it answers.
     """
     rows = {} if supervisor is None else {row.name: row for row in supervisor.rows}
     found = []
-    for name in dict.fromkeys((SERVER, *rows, *PUBLISHED)):
-        sources = [source for source in PUBLISHED.get(name, ()) if source in ages or source in known]
+    for name in dict.fromkeys((SERVER, *rows, *SOURCES)):
+        sources = [source for source in SOURCES.get(name, ()) if source in ages or source in known]
         if name == SERVER and not is_online:
             found.append(ProcessStatus(name, "gone", "", "", "", False))
         elif name in rows or sources:
