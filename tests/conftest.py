@@ -44,7 +44,7 @@ settings.register_profile(
     "kineverse",
     deadline=None,
     suppress_health_check=[HealthCheck.too_slow],
-    max_examples=45,
+    max_examples=36,
     derandomize=bool(os.environ.get("CI")),
 )
 settings.register_profile(
