@@ -278,9 +278,10 @@ class HandMotion:
     def release(self, placement: BasePlacement) -> None:
         """Open the fingers, and take the hand away."""
         self.session.phase = "release"
-        state, grasp = self.session.state, placement.grasp
+        grasp = placement.grasp
         assert grasp is not None
         self.move_fingers(self.gripper.opened)
+        state = self.session.state  # a spring may have moved the object
         world_T_bar, world_T_hand = self.bar(state), self.hand(state)
         pose = inverse(world_T_bar) @ world_T_hand
         self.session.phase = "retract"
