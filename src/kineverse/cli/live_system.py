@@ -531,8 +531,6 @@ class Screen:
         lines = [f"{SCHEME}{self._system.name}   {self._address}".rstrip()]
         lines += self._list_processes(status, width)
         lines += [join_lines(line) for line in describe_all(supervisor.reader)]
-        if status.activity is not None and status.activity.phase:
-            lines.append(f"phase: {join_lines(status.activity.phase)}")
         lines.append(self._answer or _KEYS)
         up = f"\033[{self._height}A" if self._height else ""
         text = "".join(f"\033[2K{shorten_text(line, width)}\n" for line in lines)

@@ -19,6 +19,7 @@ from .model_estimator import ModelEstimator, Proposal
 from .streams import CAMERA, LEARNER, CameraNote, LearnerNote, answer_by, decode, encode
 
 _KEPT = 600  # pictures that wait while a joint is fitted
+_THINKING = 0.1  # time between pictures after which joints are fitted, if they are due [s]
 _NEWS = 0.2  # time between two notes [s]
 _BLIND = 2.0  # time without a picture that is told of [s]
 _OFFLINE = 1.0  # time between two tries while the server is away [s]
@@ -100,7 +101,7 @@ class LearnerProcess:
         silent = time.monotonic() - self._arrival
         if silent > _BLIND:
             return f"No picture has come in for {silent:.0f} s."
-        if self._picture - self.estimator.seen_at > _BLIND:
+        if self.estimator.blind > _BLIND:
             return "The camera sees nothing that the model has."
         return ""
 
@@ -113,21 +114,29 @@ class LearnerProcess:
     # -- the other thread ------------------------------------------------------------------------------------
 
     def _work(self) -> None:
+        thought = 0.0
         while not self._is_closed:
             self._news.wait(_NEWS)
             self._news.clear()
-            while self._pictures:
+            while self._pictures and not self._is_closed:
                 stamp, poses = self._pictures.popleft()
                 self.estimator.add(poses, stamp)
-            while self._wishes:
-                if (tag := self._wishes.popleft()) in self.estimator.proposals:
-                    self.estimator.accept(tag)
-            self.estimator.think()
-            if time.monotonic() >= self._try_again:
-                self._waits = ""
-                for proposal in self.estimator.find_due():
-                    self._write(proposal)
-            self._note = self.estimator.note(waits=self._waits)
+                if abs(stamp - thought) >= _THINKING:  # also where many pictures have waited
+                    thought = stamp
+                    self._think()
+            self._think()
+
+    def _think(self) -> None:
+        """Fit and test joints, edit the model, and say what is thought."""
+        while self._wishes:
+            if (tag := self._wishes.popleft()) in self.estimator.proposals:
+                self.estimator.accept(tag)
+        self.estimator.think()
+        if time.monotonic() >= self._try_again:
+            self._waits = ""
+            for proposal in self.estimator.find_due():
+                self._write(proposal)
+        self._note = self.estimator.note(waits=self._waits)
 
     def _write(self, proposal: Proposal) -> None:
         live, estimator = self._live, self.estimator

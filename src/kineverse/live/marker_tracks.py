@@ -124,7 +124,7 @@ class MarkerTracks:
 
     def smoothed(self, name: str) -> Array:
         """Return the smoothed pose world_T_marker (4, 4), of a marker that is known."""
-        return self._still[self.names[name]]
+        return np.asarray(self._still[self.names[name]])
 
     def median(self, name: str) -> Array:
         """Return the pose (4, 4) that is the median of the last ones, of a marker that is known."""
@@ -133,7 +133,7 @@ class MarkerTracks:
 
     def latest(self, name: str) -> Array:
         """Return the last pose (4, 4) as it was seen."""
-        return self._recent[self.names[name], -1]
+        return np.asarray(self._recent[self.names[name], -1])
 
     def noise(self, name: str) -> tuple[float, float]:
         """Return the standard deviations of a known marker's position [m] and orientation [rad]."""

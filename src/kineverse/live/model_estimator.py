@@ -197,6 +197,11 @@ class ModelEstimator:
         self._refused: dict[str, float] = {}
         self.edits, self.last, self.seen_at = 0, "", -math.inf
 
+    @property
+    def blind(self) -> float:
+        """Time for which pictures have shown nothing of the model [s]; NaN before the first one."""
+        return self._now - self.seen_at
+
     # -- what is seen ----------------------------------------------------------------------------------------
 
     def add(self, poses: Mapping[str, Array], stamp: float) -> None:
