@@ -25,7 +25,7 @@ from typing import Any
 
 import numpy as np
 
-from kineverse.errors import KineverseError, OfflineError
+from kineverse.errors import KineverseError, OfflineError, UnknownNameError
 from kineverse.formats import load
 from kineverse.live.streams import (
     ACTIVITY,
@@ -210,7 +210,7 @@ def _watch(found: RealTimeRun, process: subprocess.Popen[bytes], what: str) -> N
 def _connect(process: subprocess.Popen[bytes]) -> Any:
     end = time.monotonic() + _STARTING
     while process.poll() is None and time.monotonic() < end:
-        with suppress(OfflineError):
+        with suppress(OfflineError, UnknownNameError):
             return load(f"live:{NAME}")
         time.sleep(0.2)
     raise KineverseError(f"The live system was not there within {_STARTING:g} s, or has ended.")
