@@ -343,6 +343,7 @@ class SkillTrial:
             seed=arguments.seed,
             way=OPEN_WAY if far is None else far,
             turn=OPEN_TURN if far is None else far,
+            in_thread=self._world is None,
         )
         judged = self._judge(outcome, metrics)
         there = abs(judged.value - start[coordinate])

@@ -71,6 +71,7 @@ class OpenUnknown(Behaviour):
 
     name = "unknown"
     overlap = 0.01  # a joint that was learned is off by millimetres
+    in_thread = True  # joints are fitted while the robot moves on
     heeds_edits = False  # the learner edits the model in the middle of a pull
 
     def __init__(
@@ -145,7 +146,7 @@ class OpenUnknown(Behaviour):
         self._say(f"opens '{part}'", "Nobody has described how it moves; the hand pulls and follows.")
         outcome = open_unknown(
             session, handle, model=model, part=part, hand=self.scene.gripper, seconds=self._seconds,
-            seed=self.seed + self._tries.get(part, 0),
+            seed=self.seed + self._tries.get(part, 0), in_thread=self.in_thread,
         )  # fmt: skip
         self._tries[part] = tries = self._tries.get(part, 0) + 1
         self._is_hand_checked = bool(outcome)
