@@ -204,8 +204,14 @@ def test_edits_are_followed_and_people_are_answered(shown):
 
 @pytest.mark.parametrize(
     ("rate", "spent", "is_urgent", "expected"),
-    [(60.0, 0.001, False, 1 / 30), (4.0, 0.001, False, 0.25), (60.0, 0.2, False, 0.2), (0.0, 0.0, False, 1.0)]
-    + [(0.0, 0.0, True, 0.1), (60.0, 0.001, True, 1 / 30)],
+    [
+        (60.0, 0.001, False, 1 / 30),
+        (4.0, 0.001, False, 0.25),
+        (60.0, 0.2, False, 0.2),
+        (0.0, 0.0, False, 1.0),
+        (0.0, 0.0, True, 0.1),
+        (60.0, 0.001, True, 1 / 30),
+    ],
 )
 def test_the_page_gives_way_to_a_slow_browser_and_to_others(rate, spent, is_urgent, expected):
     assert choose_pause(rate, spent, is_urgent=is_urgent) == pytest.approx(expected)
