@@ -105,7 +105,7 @@ class Child:
 
     @property
     def is_frozen(self) -> bool:
-        """Whether the system says that it is stopped."""
+        """True if the system says that it is stopped."""
         return self._cpu.state in ("T", "t")
 
     def start(self) -> None:

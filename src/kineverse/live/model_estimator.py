@@ -134,7 +134,7 @@ class _Part:
 
     @property
     def is_of_interest(self) -> bool:
-        """Whether something can be said of the part, or it was asked for."""
+        """True if something can be said of the part, or it was asked for."""
         has_moved = self.learning.poses >= _FEWEST and self.distance > _MOVED
         return self.is_named or self.written is not None or has_moved
 

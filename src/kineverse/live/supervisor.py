@@ -189,7 +189,7 @@ class Supervisor:
 
     @property
     def is_online(self) -> bool:
-        """Whether the model server answers."""
+        """True if the model server answers."""
         return self._live is not None and self._live.exchange.is_online
 
     def _tell(self, rows: Sequence[ProcessRow]) -> None:

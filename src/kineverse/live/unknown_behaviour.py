@@ -174,13 +174,7 @@ def find_coordinate(model: ModelView, part: str) -> Symbol | None:
 
 
 def find_bar(model: Model, part: str, state: State) -> str:
-    """Return the body of a part, or on it, that a hand closes around.
-
-    Raises
-    ------
-    UnknownNameError
-        If there is none.
-    """
+    """Return the body of a part, or on it, that a hand closes around; UnknownNameError without any."""
     on_it = [f for f in model.bodies if part in path_to_root(model, f) and not model.fk(f, part).symbols]
     for frame in sorted(on_it, key=lambda f: -len(path_to_root(model, f))):
         try:
