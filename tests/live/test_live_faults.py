@@ -1,9 +1,9 @@
 """A whole live system: each process is killed or frozen while the robot moves, and all is done in the end."""
 
 import pytest
+from faults import live as faults
 
 import kineverse as kv
-from faults import live as faults
 
 for module in ("coal", "daqp", "zenoh"):
     pytest.importorskip(module)
