@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -138,8 +137,9 @@ def test_a_light_wrist_turns_a_lever_against_its_spring():
     effort, spring = (("effort", 10.0),), (("spring_stiffness", 3.0), ("spring_reference", 0.0))
     with model.edit() as edit:
         edit.apply(kv.Revolute(name="robot/q", child="robot/tip", velocity=1.0, dynamics=effort, **joint))
-        tip = solid(((0.02, 0.02, 0.02), (0.1, 0, 0)))
-        edit.apply(SetBody("robot/tip", replace(tip, inertia=Inertia(0.05, (5e-4, 0, 0, 5e-4, 0, 5e-4)))))
+        light = Inertia(0.05, (5e-4, 0, 0, 5e-4, 0, 5e-4))
+        shapes = solid(((0.02, 0.02, 0.02), (0.1, 0, 0))).collisions
+        edit.apply(SetBody("robot/tip", Body(collisions=shapes, inertia=light)))
         edit.apply(kv.Revolute(name="room/lever", child="room/lever", dynamics=spring, **joint))
         edit.apply(SetBody("room/lever", solid(((0.1, 0.02, 0.02), (0.08, 0.021, 0)), mass=0.1)))
     world = MujocoWorld(model, "robot", floor=False)
