@@ -62,7 +62,7 @@ def test_lever_is_turned_before_the_door_and_let_back_as_soon_as_that_is_free(ro
         assert is_free(model, way.at(k)), way.at(k)
     # From the last run on nothing holds the lever, so what is reached is not latched again.
     assert all(is_free(model, way.at(k) | {LEVER: 0.0}) for k in range(way.last_run, len(way)))
-    assert way.values[way.last_run, 1] < 0.2
+    assert 0.04 < way.values[way.last_run, 1] < 0.08
     assert [way.at(k) for k in way.corners][:1] == [{LEVER: pytest.approx(0.72), DOOR: 0.0}]
 
 
@@ -192,7 +192,7 @@ def test_microwave_is_opened_by_shipped_robots(robot, world, noise):
 @pytest.mark.long
 def test_microwave_is_latched_before_it_is_let_go():
     pytest.importorskip("mujoco")
-    outcome, values = move(microwave(), "hsr", OVEN, world="mujoco", noise=False, target=0.0, at={OVEN: 0.3})
+    outcome, _ = move(microwave(), "hsr", OVEN, world="mujoco", noise=False, target=0.0, at={OVEN: 0.3})
     assert outcome, outcome.reason
     assert outcome.value < 0.003  # its spring would open it again
     assert "unlatched" not in outcome.measures

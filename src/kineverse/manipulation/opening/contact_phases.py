@@ -12,6 +12,7 @@ import math
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise, takewhile
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -21,16 +22,19 @@ from kineverse.lie import Array
 from kineverse.manipulation.outcome import SkillError
 from kineverse.model.model_view import ModelView
 from kineverse.model.symbolic_view import cached_for_version
-from kineverse.reasoning import Interlocks, UnlockingPlan, UnlockingStep, interlocks, plan_unlocking
 from kineverse.state import State
 from kineverse.symbols import Symbol
 from kineverse.worlds import Robot
+
+if TYPE_CHECKING:
+    from kineverse.reasoning import UnlockingPlan, UnlockingStep
 
 _STEP = 0.05  # distance of neighbouring values along a way [m], [rad]
 _CLEAR = (
     0.1  # way beyond the place from which on a key is not needed any more, where it is let back [m], [rad]
 )
 _BEYOND = 0.12  # largest distance by which a held key goes beyond its threshold [m], [rad]
+_HALVINGS = 5  # steps in which that place is found between two rows of a way
 _SIGMAS = 3.0  # standard deviations from where it rests up to which a part may rest
 _SHARE = 0.4  # largest distance from a target, as a share of its distance beyond a threshold
 
@@ -232,22 +236,30 @@ class PhasePlanner:
         """
         *keys, last = end
         resting = {s: float(state[s]) for s in keys}
-        run = Way.straight(last, before, end[last]).values[:, 0]
-        for value in run[1:].tolist():
-            there = state.updated({**resting, last: value})
-            plan = self._plan(there, target, ())
-            if plan.verdict != "found" or any(step.coordinate in keys for step in plan.steps):
-                continue
-            beyond = math.copysign(_CLEAR, end[last] - before)
-            value = value + beyond if abs(end[last] - value) > _CLEAR else end[last]
-            pulled = [*(end[s] for s in keys), value]
-            end |= resting
-            return [pulled, [*resting.values(), value]]
-        return []
+
+        def is_free(value: float) -> bool:
+            plan = self._plan(state.updated({**resting, last: value}), target, ())
+            return plan.verdict == "found" and not any(step.coordinate in keys for step in plan.steps)
+
+        run = Way.straight(last, before, end[last]).values[:, 0].tolist()
+        k = next((k for k in range(1, len(run)) if is_free(run[k])), None)
+        if k is None:
+            return []
+        latched, free = run[k - 1], run[k]
+        for _ in range(_HALVINGS):
+            middle = (latched + free) / 2
+            latched, free = (latched, middle) if is_free(middle) else (middle, free)
+        rest = end[last] - free
+        free = free + math.copysign(_CLEAR, rest) if abs(rest) > _CLEAR else end[last]
+        pulled = [*(end[s] for s in keys), free]
+        end |= resting
+        return [pulled, [*resting.values(), free]]
 
     def _plan(self, state: State, target: float, still: Collection[Symbol]) -> UnlockingPlan:
+        from kineverse.reasoning import interlocks, plan_unlocking  # for start-up time
+
         model = self._model
-        found: Interlocks = cached_for_version(model, ("interlocks",), lambda: interlocks(model))
+        found = cached_for_version(model, ("interlocks",), lambda: interlocks(model))
         goal, places = {self.coordinate: target}, {s: state[s] for s in self._objects}
         return plan_unlocking(model, goal, places, found=found, fixed=still)
 
