@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from .learner_process import LearnerProcess as LearnerProcess
     from .live_page import LivePage as LivePage
     from .live_robot import LiveBelief as LiveBelief, LiveRobot as LiveRobot
+    from .model_estimator import ModelEstimator as ModelEstimator
     from .tracker_process import TrackerProcess as TrackerProcess
     from .unknown_behaviour import OpenUnknown as OpenUnknown, make_unknown_scene as make_unknown_scene
     from .world_process import WorldProcess as WorldProcess
