@@ -18,7 +18,7 @@ from kineverse.manipulation import ArticulatedObject, Outcome, Session, open_unk
 from kineverse.manipulation.articulated_objects import find_shut_value
 from kineverse.manipulation.unknown_objects import forget_joint
 from kineverse.manipulation.unknown_objects.unmodelled_joint import free_part
-from kineverse.model.model import Model
+from kineverse.model.model import Model, Snapshot
 from kineverse.model.model_view import ModelView
 from kineverse.state import State
 from kineverse.symbols import Symbol, position
@@ -137,7 +137,9 @@ class OpenUnknown(Behaviour):
 
     def _open(self, session: Session, part: str) -> None:
         """Open a part by pulling at its handle, and learning how it moves."""
-        model = session.model if isinstance(session.model, Model) else session.model.model()
+        given = session.model
+        model = given.model() if isinstance(given, Snapshot) else given
+        assert isinstance(model, Model)
         try:
             handle = find_bar(model, part, session.state)
         except KineverseError as error:
@@ -174,7 +176,7 @@ def find_coordinate(model: ModelView, part: str) -> Symbol | None:
 
 
 def find_bar(model: Model, part: str, state: State) -> str:
-    """Return the body of a part, or on it, that a hand closes around; UnknownNameError without any."""
+    """Return the body of a part, or on it, that a hand closes around; UnknownNameError if there is none."""
     on_it = [f for f in model.bodies if part in path_to_root(model, f) and not model.fk(f, part).symbols]
     for frame in sorted(on_it, key=lambda f: -len(path_to_root(model, f))):
         try:
