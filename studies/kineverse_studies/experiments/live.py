@@ -284,7 +284,8 @@ def make_live_report(
     columns = {
         "robot": lambda one: one.robot,
         "object": lambda one: one.thing,
-        "done": lambda one: f"{one.done} of {one.wanted}",
+        "skills": lambda one: str(one.wanted),
+        "done": lambda one: str(one.done),
         "time of one [s]": lambda one: f"{np.mean(one.seconds):.1f}" if one.seconds else "-",
         "error of the estimate [mm], [mrad]": lambda one: f"{1e3 * one.error:.1f}",
         "force [N]": lambda one: f"{one.force:.0f}",
