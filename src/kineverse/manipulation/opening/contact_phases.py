@@ -30,9 +30,7 @@ if TYPE_CHECKING:
     from kineverse.reasoning import UnlockingPlan, UnlockingStep
 
 _STEP = 0.05  # distance of neighbouring values along a way [m], [rad]
-_CLEAR = (
-    0.1  # way beyond the place from which on a key is not needed any more, where it is let back [m], [rad]
-)
+_CLEAR = 0.1  # way beyond the place from which on a key is not needed after which it is let back [m], [rad]
 _BEYOND = 0.12  # largest distance by which a held key goes beyond its threshold [m], [rad]
 _HALVINGS = 5  # steps in which that place is found between two rows of a way
 _SIGMAS = 3.0  # standard deviations from where it rests up to which a part may rest
