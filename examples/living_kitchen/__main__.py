@@ -26,7 +26,7 @@ from kineverse.errors import InvalidValueError, KineverseError  # noqa: E402
 from living_kitchen.picture import save  # noqa: E402 - after the path
 from living_kitchen.report import tabulate_identification, tabulate_tracking  # noqa: E402
 from living_kitchen.simulation import Simulation  # noqa: E402
-from living_kitchen.track import average  # noqa: E402
+from living_kitchen.track import TrackingQuality, average  # noqa: E402
 from living_kitchen.unknown_mechanisms import MECHANISMS  # noqa: E402
 
 SECONDS, STEP, SETTLED = 18.0, 1.0 / 12.0, 3.0
@@ -78,7 +78,8 @@ def simulate(arguments: argparse.Namespace) -> int:
     # First, so that an unwritable path is reported before the work.
     check_picture_path(arguments.picture)
     check_file_path(arguments.picture)
-    simulation, qualities = Simulation(mechanism=arguments.stranger), []
+    simulation = Simulation(mechanism=arguments.stranger)
+    qualities: list[TrackingQuality] = []
     for _ in show_progress(range(round(arguments.seconds / STEP)), "living", "step"):
         simulation.step(STEP)
         if simulation.time > SETTLED or not qualities:

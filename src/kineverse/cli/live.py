@@ -111,7 +111,7 @@ def check_task(do: str, far: float, rounds: int) -> None:
         raise InvalidValueError(f"--far is a share of the way between 0.1 and 1, not {far:g}.")
 
 
-def parse_noise(text: str) -> Sensors:
+def parse_sensors(text: str) -> Sensors:
     """Return the sensors of ``--noise``."""
     from kineverse.worlds import Sensors  # for start-up time
 
@@ -194,7 +194,7 @@ def _run_world(arguments: argparse.Namespace) -> int:
         "recording": arguments.record is not None,
     }
     require("kineverse world", extras)
-    timeout, sensors = parse_time(arguments.timeout, "--timeout"), parse_noise(arguments.noise)
+    timeout, sensors = parse_time(arguments.timeout, "--timeout"), parse_sensors(arguments.noise)
     check_force(arguments.force_limit)
     if arguments.seed < 0:
         raise InvalidValueError(f"--seed is a number from 0 on, not {arguments.seed}.")
@@ -293,7 +293,7 @@ def _add_track_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _run_track(arguments: argparse.Namespace) -> int:
     require("kineverse track", {"exchange": True})
-    sensors = parse_noise(arguments.noise)
+    sensors = parse_sensors(arguments.noise)
     from kineverse.live import TrackerProcess  # for start-up time
 
     with handle_interrupts(), live_model(arguments) as live:

@@ -36,7 +36,7 @@ from .live import (
     check_force,
     check_task,
     find_start,
-    parse_noise,
+    parse_sensors,
     results_as_data,
 )
 from .output import format_table, join_lines, shorten_text, show_activity
@@ -136,7 +136,7 @@ def run(arguments: argparse.Namespace) -> int:
     }
     require("kineverse live", extras, compiler=True)
     check_picture_path(arguments.picture)
-    parse_noise(arguments.noise)
+    parse_sensors(arguments.noise)
     check_force(arguments.force_limit)
     check_task(arguments.do, arguments.far, arguments.rounds)
     if arguments.seed < 0:
@@ -297,14 +297,14 @@ class LiveSystem:
 
     @property
     def is_over(self) -> bool:
-        """Whether all objects were handled."""
+        """True if all objects were handled."""
         if self.do == _UNKNOWN:
             return self.supervisor.children["behave"].is_done
         return self.do != "closer" and all(map(self._is_handled, self.names))
 
     @property
     def is_done(self) -> bool:
-        """Whether all objects were opened and closed, or what was wanted."""
+        """True if all objects were opened and closed, or what was wanted."""
         return all(one["done"] for one in self.list_objects())
 
     def list_objects(self) -> list[dict[str, Any]]:

@@ -6,13 +6,7 @@ from kineverse._lazy import lazy_face
 
 if TYPE_CHECKING:
     from .behaviour_process import BehaviourProcess as BehaviourProcess
-    from .behaviours import (
-        Behaviour as Behaviour,
-        Closer as Closer,
-        CloseByName as CloseByName,
-        OpenByName as OpenByName,
-        Tour as Tour,
-    )
+    from .behaviours import Behaviour as Behaviour
     from .learner_process import LearnerProcess as LearnerProcess
     from .live_page import LivePage as LivePage
     from .live_robot import LiveBelief as LiveBelief, LiveRobot as LiveRobot

@@ -197,12 +197,7 @@ def read_note(reader: StateReader, source: str, kind: type[Note]) -> Note | None
 def ask(reader: StateReader, source: str, do: str, timeout: float = 5.0, **arguments: Any) -> Any:
     """Ask a process to do something, and return its answer.
 
-    Raises
-    ------
-    OfflineError
-        If it does not answer.
-    KineverseError
-        With its reason if it cannot do that.
+    One that does not answer is an OfflineError, and one that cannot do it a KineverseError with its reason.
     """
     answer = decode(reader.ask(source, encode(Ask(do, arguments)), timeout), Answer)
     if answer is None:
