@@ -91,13 +91,13 @@ def test_words_of_the_result_say_who_believes_it(run, outside):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        ([*PUSH, "--world", "gazebo"], "there is no such world. There is kinematic, mujoco, ros"),
+        ([*PUSH, "--world", "gazebo"], "there is no such world. There is kinematic, mujoco, live, ros"),
         ([*PUSH, "--world", "ros:"], "there is no such world"),
         ([*PUSH, *ROS, "--from", "1cm"], "--from is for simulated worlds; with --world ros, the robot sees"),
         ([*PUSH, *ROS, "--set", "arm/slide=0.1"], "--set is for simulated worlds"),
         ([*PUSH, *ROS, "--noise", "3mm"], "--noise is for simulated worlds"),
         ([*PUSH, *ROS, "--base", "omni"], "a robot with a base says itself where it stands"),
-        ([*PLAN, "--to", "arm/slide=0.1", "--world", "mujoco"], "there is no such world. There is ros"),
+        ([*PLAN, "--to", "arm/slide=0.1", "--world", "mujoco"], "there is no such world. There is live, ros"),
         ([*PLAN, "--to", "arm/slide=0.1", *ROS, "--from", "arm/slide=0.2"], "says itself where it is"),
     ],
 )

@@ -9,7 +9,7 @@ from lock_step import LockStep
 
 import kineverse as kv
 from kineverse.errors import UnknownNameError
-from kineverse.live import Closer, OpenByName, Tour
+from kineverse.live.behaviours import Closer, OpenByName, Tour
 from kineverse.worlds import KinematicWorld, TrueBelief
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "worlds"))

@@ -27,7 +27,7 @@ from kineverse.worlds import RobotInterface, RunMetrics, SimulatedWorld
 
 from .arguments import check_unit, load_model, parse_assignments, parse_value, print_notes
 from .output import join_lines, print_line, show_activity
-from .outside_robot import is_live
+from .outside_robot import check_served, is_live
 from .plan_arguments import find_robot_name, parse_robot
 
 if TYPE_CHECKING:
@@ -75,6 +75,7 @@ def make_scene(
     source, place = parse_robot(arguments.robot)
     model = load_model(arguments, arguments.model)
     if is_live(arguments.world):
+        check_served(arguments.model)
         name = find_robot_name(model, source)
         placed = PlacedRobot(name, Robot.of(model, name).planar_base, {}, name)
     else:

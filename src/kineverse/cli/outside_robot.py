@@ -92,15 +92,21 @@ def is_live(world: str | None) -> bool:
     return world == _LIVE
 
 
+def check_served(model: str) -> None:
+    """Check that a model is the served one, for ``--world live``."""
+    from kineverse.exchange.address import SCHEME  # for start-up time
+
+    if not model.startswith(SCHEME):
+        raise InvalidValueError(f"--world live is for a served model, {SCHEME}NAME, not {model!r}.")
+
+
 @contextmanager
 def _connect_live(robot: Robot, server: str) -> Iterator[LiveRobot]:
     """Connect the robot of a live system."""
     from kineverse.exchange import Connection  # for start-up time
-    from kineverse.exchange.address import SCHEME, Address  # for start-up time
+    from kineverse.exchange.address import Address  # for start-up time
     from kineverse.live import LiveRobot  # for start-up time
 
-    if not server.startswith(SCHEME):
-        raise InvalidValueError(f"--world live is for a served model, {SCHEME}NAME, not {server!r}.")
     with (
         closing(Connection(Address.parse(server))) as connection,
         closing(LiveRobot(robot.model, robot, connection)) as connected,

@@ -23,7 +23,7 @@ from kineverse.worlds import Robot
 
 from .arguments import add_model_options, load_model, needs_mujoco, parse_length, require
 from .output import format_table, join_lines, name_options, show_activity
-from .outside_robot import ConnectedRobot, check_world, connect_robot, is_live
+from .outside_robot import ConnectedRobot, check_served, check_world, connect_robot, is_live
 from .pages import (
     add_page_options,
     check_picture_path,
@@ -245,6 +245,7 @@ def _prepare(
         standing: dict[kv.Symbol, float] = {}
         robot = next(iter(model.frames), "").partition("/")[0]
         if is_live(arguments.world):
+            check_served(arguments.model)
             robot = find_robot_name(model, arguments.robot)
         elif arguments.robot is not None:
             # Whose joints are whose, a robot outside is told by prefixes, as kineverse open does.

@@ -204,27 +204,13 @@ class StatePublisher(Closing):
 
 
 class Newest(NamedTuple):
-    """Newest vector of a source.
+    """Newest vector of a source."""
 
-    Attributes
-    ----------
-    names
-        Names of its coordinates.
-    values
-        Their values (n,): [m], [rad] and their rates by time.
-    stamp
-        Time of the values by the source's clock [s].
-    note
-        What the source has said beside it.
-    arrival
-        Time at which it came in, by the clock that only counts [s].
-    """
-
-    names: tuple[str, ...]
-    values: Array
-    stamp: float
-    note: bytes
-    arrival: float
+    names: tuple[str, ...]  # of its coordinates
+    values: Array  # their values (n,): [m], [rad] and their rates by time
+    stamp: float  # time of the values by the source's clock [s]
+    note: bytes  # what the source has said beside it
+    arrival: float  # time at which it came in, by the clock that only counts [s]
 
 
 class StateReader(Closing):

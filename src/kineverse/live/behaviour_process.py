@@ -24,15 +24,7 @@ _BEAT = 0.3  # time after which what is done is told again, as while a plan is m
 
 
 class LiveSessions:
-    """Source of sessions with the robot of a live system, for :class:`.Behaviour`.
-
-    Parameters
-    ----------
-    live
-        The served model.
-    robot
-        Prefix of the robot's names.
-    """
+    """Source of sessions with the robot of a live system, for :class:`.Behaviour`."""
 
     def __init__(self, live: LiveModel, robot: str) -> None:
         self._live, self._name = live, robot

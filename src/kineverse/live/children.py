@@ -57,45 +57,22 @@ class Child:
     """Command of Kineverse in a process of its own.
 
     It is started by the thread of a supervisor that lives as long as that: on Linux a child dies with the
-    thread that has started it.
-
-    Parameters
-    ----------
-    name
-        Its name in tables.
-    words
-        Words of the command after ``kineverse``, which may be others at the next start.
-    folder
-        Folder for what it prints.
-    may_end
-        Whether it may come to an end by itself, with exit status 0 or 1.
-
-    Attributes
-    ----------
-    pid
-        Number of the process; 0 while there is none.
-    status
-        Exit status of the last one; None before the first end.
-    ends
-        Number of unwanted ends.
-    is_done
-        Whether it has come to an end by itself.
-    prepare
-        Is called before it is started again.
+    thread that has started it. What it prints goes to a file of the folder. With ``may_end`` it may come to
+    an end by itself, with exit status 0 or 1; any other end is unwanted.
     """
 
     def __init__(
         self, name: str, words: Sequence[str], folder: str | os.PathLike[str], *, may_end: bool = False
     ) -> None:
-        self.name, self.words = name, list(words)
+        self.name, self.words = name, list(words)  # in tables; after ``kineverse``, at the next start
         self.log = Path(folder) / f"{name}.log"
-        self.status: int | None = None
-        self.ends, self.is_done = 0, False
+        self.status: int | None = None  # exit status of the last end
+        self.ends, self.is_done = 0, False  # number of unwanted ends; whether it has ended by itself
         self._may_end, self._recent = may_end, deque[float](maxlen=_MOST_ENDS)
         self._process: subprocess.Popen[bytes] | None = None
         self._due = 0.0  # when it is started again
         self.started = -math.inf
-        self.prepare: Callable[[], object] = lambda: None
+        self.prepare: Callable[[], object] = lambda: None  # is called before it is started again
         self._cpu = _Usage(0)
 
     @property
@@ -123,10 +100,7 @@ class Child:
     def watch(self) -> bool:
         """Notice an end, and start it again after a pause; return True if it was started.
 
-        Raises
-        ------
-        GivenUpError
-            If it has ended too often, with the last line that it printed.
+        One that has ended too often is a GivenUpError, with the last line that it printed.
         """
         now = time.monotonic()
         if self._process is not None:

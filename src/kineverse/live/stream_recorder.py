@@ -39,23 +39,8 @@ class StreamRecorder(Closing):
     """Thread that writes the newest of all streams to an MCAP file, until it is closed.
 
     It begins with the first word of the world, whose time is 0 in the file. Values of coordinates that an
-    edit brings meanwhile are left out: the file has the model of its beginning.
-
-    Parameters
-    ----------
-    path
-        Path that ends in ``.mcap``.
-    connection
-        Connection to the model server.
-    model
-        Model of the robot and of everything around it.
-    about
-        Texts to keep, such as the robot and the world.
-
-    Raises
-    ------
-    MissingDependencyError, FormatError
-        As for :class:`.Recorder`.
+    edit brings meanwhile are left out: the file has the model of its beginning. Errors are those of
+    :class:`.Recorder`.
     """
 
     def __init__(

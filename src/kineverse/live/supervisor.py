@@ -66,31 +66,9 @@ class LiveStatus:
 class Supervisor:
     """Processes of a live system around a model server, from the start of all to the end of all.
 
-    Parameters
-    ----------
-    name
-        Name of the model server.
-    commands
-        Words of each command by the name of its process, in the order of their start; the server is first.
-    folder
-        Folder of the run, for what is kept and printed.
-    ending
-        Names of processes that may come to an end by themselves.
-    prepare
-        Is called with a process before it is started again, and with the state of the system: it may change
-        the words of its command.
-
-    Attributes
-    ----------
-    status
-        The present state.
-    children
-        The processes, by name.
-
-    Raises
-    ------
-    GivenUpError
-        By :meth:`look`, once a process ends again and again.
+    The commands are words by the name of their process, in the order of their start, the server first.
+    A folder keeps what they print. Those in ``ending`` may come to an end by themselves. ``prepare`` is run
+    with a process before it is started again, and with the state of the system: it may change the words.
     """
 
     def __init__(
@@ -125,10 +103,7 @@ class Supervisor:
     def start(self) -> None:
         """Start the server, wait for it, and start all others.
 
-        Raises
-        ------
-        KineverseError
-            If the server does not come up, with what it says.
+        A server that does not come up is a KineverseError, with what it says.
         """
         server, *others = self.children.values()
         server.start()
