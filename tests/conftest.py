@@ -36,6 +36,7 @@ from native_libraries import compile_native_libraries
 ROOT = Path(__file__).parents[1]
 sys.path.append(str(ROOT / "examples"))  # living_kitchen
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
+FINE = 2  # computed pixels along the edge of one of a picture
 ROS_PYTHON = Path(sys.prefix, "ros", "bin", "python")  # of wheels, with the packages of this environment
 
 # No test depends on the load of the machine.
@@ -182,6 +183,26 @@ def _models_are_remembered() -> Generator[None]:
     before, loader.MOST_REMEMBERED = loader.MOST_REMEMBERED, 100
     yield
     loader.MOST_REMEMBERED = before
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _pictures_are_coarse() -> Generator[None]:
+    """A picture has a computed pixel for each of its own, a quarter of the usual work."""
+    from kineverse.view import pictures
+
+    before, pictures.SAMPLES = pictures.SAMPLES, 1
+    yield
+    pictures.SAMPLES = before
+
+
+@pytest.fixture(scope="module")
+def fine_pictures() -> Generator[None]:
+    """Pictures are as fine as those of users."""
+    from kineverse.view import pictures
+
+    before, pictures.SAMPLES = pictures.SAMPLES, FINE
+    yield
+    pictures.SAMPLES = before
 
 
 @pytest.fixture(scope="session")

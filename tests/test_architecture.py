@@ -8,6 +8,7 @@ import runpy
 import sys
 import tomllib
 from collections import Counter
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -73,6 +74,7 @@ def test_modules_and_folders_have_a_good_size() -> None:
     assert {folder: n for folder, n in folders.items() if n > MOST_FILES} == {}
 
 
+@cache
 def _modules() -> dict[str, Path]:
     return find_modules(ROOT / "src", ROOT / "studies")
 
@@ -88,7 +90,7 @@ def test_hand_written_c_is_in_files() -> None:
         f"{path}:{node.lineno}"
         for path in sorted((ROOT / "src").rglob("*.py"))
         for node in _strings_of(ast.parse(path.read_text("utf-8")))
-        if _is_c(node.value) and node.value.count("\n") >= MOST_LINES_OF_C
+        if node.value.count("\n") >= MOST_LINES_OF_C and _is_c(node.value)
     ]
     assert pieces == []
     files = [path.read_text("utf-8") for path in sorted((ROOT / "src/kineverse/_native").rglob("*.[ch]"))]
@@ -97,8 +99,9 @@ def test_hand_written_c_is_in_files() -> None:
 
 def _strings_of(module: ast.Module) -> list[ast.Constant]:
     """Return the strings of a module but those that stand alone, which document what is above them."""
-    alone = {id(node.value) for node in ast.walk(module) if isinstance(node, ast.Expr)}
-    strings = [node for node in ast.walk(module) if isinstance(node, ast.Constant) and id(node) not in alone]
+    nodes = [*ast.walk(module)]
+    alone = {id(node.value) for node in nodes if isinstance(node, ast.Expr)}
+    strings = [node for node in nodes if isinstance(node, ast.Constant) and id(node) not in alone]
     return [node for node in strings if isinstance(node.value, str)]
 
 

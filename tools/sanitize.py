@@ -25,7 +25,7 @@ REPORTED = 86
 COMPILER = """#!/bin/sh
 for argument; do
     shift
-    case "$argument" in -O2 | -O3) argument=-Og ;; esac
+    case "$argument" in -O2 | -O3) argument=LEVEL ;; esac
     set -- "$@" "$argument"
 done
 exec gcc -fsanitize=address,undefined -fno-sanitize-recover=undefined -fno-omit-frame-pointer -g1 "$@"
@@ -65,11 +65,11 @@ def find_libraries() -> list[str] | None:
     return found
 
 
-def environment(folder: Path, libraries: list[str]) -> dict[str, str]:
-    """Return an environment in which all C is built with sanitizers, with files in a folder."""
+def environment(folder: Path, libraries: list[str], level: str = "-Og") -> dict[str, str]:
+    """Return an environment in which all C is built with sanitizers at a level, with files in a folder."""
     compiler, preloaded = folder / "sanitizing-gcc", folder / "preloaded.so"
     report = f"log_path={folder}/report"
-    compiler.write_text(COMPILER, encoding="utf-8")
+    compiler.write_text(COMPILER.replace("LEVEL", level), encoding="utf-8")
     compiler.chmod(compiler.stat().st_mode | stat.S_IXUSR)
     build = ["gcc", "-shared", "-fPIC", "-x", "c", "-", "-o", str(preloaded)]
     subprocess.run(build, input=PRELOADED, text=True, encoding="utf-8", check=True)
@@ -160,7 +160,8 @@ def main(arguments: list[str]) -> int:
         command += arguments or [str(ROOT / "tests" / package) for package in PACKAGES]
         if short:
             command = [sys.executable, __file__, "--inside"]
-        status = subprocess.run(command, env=environment(Path(name), libraries), cwd=ROOT).returncode
+        inside = environment(Path(name), libraries, "-O0" if short else "-Og")
+        status = subprocess.run(command, env=inside, cwd=ROOT).returncode
         reports = [
             path.read_text(encoding="utf-8", errors="replace") for path in sorted(Path(name).glob("report.*"))
         ]

@@ -181,7 +181,8 @@ def test_info_counts_one_thing_and_names_missing_meshes(run, tmp_path):
         encoding="utf-8",
     )
     status, out, _ = run("info", str(robot), "--constraints")
-    assert "-0" not in out
+    assert status == 0
+    assert "-0" not in "".join(line for line in out.splitlines() if "r.urdf" not in line)
 
 
 def test_picture_that_cannot_be_written_is_refused_before_the_work(run, tmp_path):

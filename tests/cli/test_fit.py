@@ -153,10 +153,9 @@ def test_correlated_neighbours_count_once(tmp_path, capsys):
     assert f"are worth {found['judged']} independent ones" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("suffix", ["png", "svg"])
-def test_the_picture_is_drawn(door, tmp_path, capsys, suffix):
+def test_the_picture_is_drawn(door, tmp_path, capsys):
     pytest.importorskip("matplotlib")
-    file = tmp_path / f"door.{suffix}"
+    file = tmp_path / "door.svg"  # a drawer has a PNG below
     words = [door, *DOOR, *TWO, "--noise", "2mm,0.5deg", "--picture", str(file)]
     assert main(["fit", *words]) == 0
     assert f"picture: {file}" in capsys.readouterr().out

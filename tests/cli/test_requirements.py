@@ -104,7 +104,7 @@ def test_a_picture_needs_nothing_beyond_the_core(tmp_path: Path) -> None:
     # In another process: here modules have been imported that would not be without the extras.
     program = (
         f"import sys\nfor name in {[*MODULES.values(), 'trimesh', 'collada', 'PIL', 'scipy']!r}: sys.modules[name] = None\n"
-        "from kineverse.cli import main\n"
+        "from kineverse.cli import main\nfrom kineverse.view import pictures\npictures.SAMPLES = 1\n"
         "sys.exit(main(['view', 'articulations/ratchet', '--picture', 'k.png']))"
     )
     done = subprocess.run(

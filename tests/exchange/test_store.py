@@ -260,8 +260,8 @@ def test_a_backup_is_the_store_of_that_moment(path: Path, tmp_path: Path) -> Non
 
 def test_a_damaged_store_is_refused_or_at_a_revision_that_was_committed(tmp_path: Path) -> None:
     """``make faults ARGS=store`` tries more."""
-    outcomes = try_damages(100, 1, tmp_path)
-    assert min(outcomes.values()) > 20
+    outcomes = try_damages(60, 1, tmp_path)
+    assert min(outcomes.values()) > 12
 
 
 def test_the_search_for_faults_notices_a_store_that_checks_nothing(
@@ -274,9 +274,9 @@ def test_the_search_for_faults_notices_a_store_that_checks_nothing(
 
 def test_what_was_acknowledged_survives_a_kill(tmp_path: Path) -> None:
     """A process that commits is killed, again and again; while it runs, another one is refused."""
-    revisions = try_kills(5, 1, tmp_path)
+    revisions = try_kills(3, 1, tmp_path)
     assert revisions == sorted(revisions)
-    assert revisions[-1] > 5
+    assert revisions[-1] > 3
 
 
 def test_a_full_disk_leaves_the_last_revision(path: Path) -> None:

@@ -196,12 +196,17 @@ def test_messages_come_in_order_and_whole(pair: tuple[Transport, Transport]) -> 
 def test_a_slow_reader_gets_the_newest_messages(pair: tuple[Transport, Transport]) -> None:
     server, client = pair
     slow, quick = client.subscribe("k/log", 3), collect(client.subscribe("k/log"))
-    for number in range(10):
+    for number in range(256):  # what is sent before the subscriptions are known is lost
         server.publish("k/log", bytes([number]))
-    until(lambda: len(quick) == 10)
+        late = time.monotonic() + 1.0
+        while quick[-1:] != [bytes([number])] and time.monotonic() < late:
+            time.sleep(0.001)
+        if len(quick) >= 10 and quick[-1] == bytes([number]):
+            break
     found = collect(slow)
-    until(lambda: len(found) == 3)
-    assert found == [b"\x07", b"\x08", b"\x09"]
+    until(lambda: found[-1:] == quick[-1:])
+    assert found[-3:] == quick[-3:]
+    assert len(found) < 5
 
 
 def test_a_taken_endpoint_is_refused(pair: tuple[Transport, Transport], endpoint: str) -> None:

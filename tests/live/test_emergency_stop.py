@@ -85,6 +85,7 @@ def test_a_world_that_was_started_anew_is_stopped_again(robot):
 def test_a_stop_that_somebody_else_has_released_stays_released(robot):
     stop = EmergencyStop(robot)
     stop.stop()
+    stop.watch()
     robot.stopped, robot.ticks = "", robot.ticks + 10
     for _ in range(3):
         stop.watch()

@@ -19,12 +19,15 @@ from kineverse.live.live_page import LivePage, find_robot_prefix, read_step, rea
 from kineverse.live.people import Place, move_furniture
 from kineverse.live.streams import (
     ACTIVITY,
+    LEARNER,
     ROBOT,
     SUPERVISOR,
     TRACKER,
     TRUTH,
     ActivityNote,
+    LearnerNote,
     ProcessRow,
+    ProposalRow,
     RobotNote,
     SupervisorNote,
     answer_by,
@@ -44,9 +47,9 @@ class Streams:
 
     def put(self, source, values=None, note=None):
         values, handlers = values or {}, {"stop": self._stop, "release": self._release, "move": self._move}
+        handlers |= {"accept": lambda tag: self.asked.append(tag)}
         if source not in self._sources:
-            answer = answer_by(handlers) if source == ROBOT else None
-            self._sources[source] = self._live.exchange.publisher(source, values, answer=answer)
+            self._sources[source] = self._live.exchange.publisher(source, values, answer=answer_by(handlers))
         self._told[source] = list(values.values()), b"" if note is None else encode(note)
         self.repeat()
 
@@ -197,6 +200,17 @@ def test_edits_are_followed_and_people_are_answered(shown):
     np.testing.assert_allclose(page.pose(CUPBOARD)[:2, 3], (2.0, 1.0), atol=1e-9)
     move_furniture(live, CUPBOARD, 3.0, 1.0, 0.0)
     drawn(system, streams, lambda: people._x.value == 3.0)
+
+
+def test_a_proposal_of_the_learner_is_accepted(shown):
+    system, _, streams, _ = shown
+    streams.put_robot()
+    streams.put(LEARNER, note=LearnerNote(proposals=[ProposalRow("joint door", "a hinge")]))
+    drawn(system, streams, lambda: "proposed: a hinge" in text(system))
+    drawn(system, streams, lambda: not system._people._accept.disabled)
+    system._people._accept_proposal()
+    drawn(system, streams, lambda: "accepted: joint door" in system._people._answer.content)
+    assert streams.asked == ["joint door"]
 
 
 def test_a_browser_that_is_behind_gets_nothing_more(shown, monkeypatch):

@@ -21,6 +21,7 @@ from kineverse.live.streams import (
     ProcessRow,
     ProposalRow,
     RobotNote,
+    SkillResult,
     SupervisorNote,
     TrackerNote,
     WatchedPart,
@@ -55,17 +56,28 @@ def test_the_word_of_the_supervisor_counts_unless_the_news_are_old():
 
 def test_the_activity_has_its_reason_and_its_results():
     assert "no behaviour" in describe_activity(None)[0]
-    note = ActivityNote("closer", "close a/door", "it is open", done=2, failed=1, last="a/drawer is shut")
+    note = ActivityNote(
+        "closer", "close a/door", "it is open", "pull", done=2, failed=1, last="a/drawer is shut"
+    )
     assert describe_activity(note) == [
         "closer: close a/door",
         "why: it is open",
+        "phase: pull",
         "so far 2 done, 1 failed",
         "last: a/drawer is shut",
+    ]
+    note.results = [SkillResult(name, "close", name != "d", "it slips", 3.2) for name in "abcd"]
+    assert describe_activity(note)[4:] == [
+        "close d: failed, it slips (3 s)",
+        "close c: done (3 s)",
+        "close b: done (3 s)",
     ]
 
 
 def test_the_pace_is_that_of_world_and_control():
-    robot = RobotNote("mujoco", 0.04, [], "emergency stop", 12.3, 4, 2, 7, 1000, 0.9987)
+    robot = RobotNote(
+        "mujoco", 0.04, [], "emergency stop", 12.3, refused=4, late=2, dropped=7, ticks=1000, factor=0.9987
+    )
     stopped, pace = describe_robot(robot, ActivityNote("tour", steps=400, late=1))
     assert stopped == "stopped: emergency stop"
     expected = "force 12 N · real-time factor 0.999 · late 0.2% of ticks, 0.2% of control"

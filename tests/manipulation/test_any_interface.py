@@ -47,11 +47,9 @@ def connect(robot, **values):
     return world, Session(Elsewhere(world))
 
 
-ROBOTS = ["hsr", pytest.param("pr2", marks=pytest.mark.long), pytest.param("fetch", marks=pytest.mark.long)]
-
-
-@pytest.mark.parametrize("robot", ROBOTS)
-@pytest.mark.parametrize("what", [FRIDGE, pytest.param(DRAWER, marks=pytest.mark.long)])
+@pytest.mark.long  # docs/manipulation.md has a robot of one's own that opens a drawer
+@pytest.mark.parametrize("robot", ["hsr", "pr2", "fetch"])
+@pytest.mark.parametrize("what", [FRIDGE, DRAWER])
 def test_any_robot_opens_and_closes(robot, what):
     world, session = connect(robot)
     for target in (OPEN[what], 0.0):
@@ -63,7 +61,9 @@ def test_any_robot_opens_and_closes(robot, what):
         assert world.held is None
 
 
-@pytest.mark.parametrize("robot", ROBOTS)
+@pytest.mark.parametrize(
+    "robot", ["hsr", *(pytest.param(one, marks=pytest.mark.long) for one in ("pr2", "fetch"))]
+)
 def test_any_robot_pushes_a_drawer_shut(robot):
     world, session = connect(robot, **{DRAWER: 0.4})
     outcome = push(session, DRAWER)

@@ -43,7 +43,7 @@ def at(model: Model, **values: float) -> State:
     return model.default_state().updated(values)
 
 
-@pytest.mark.sampled(2)
+@pytest.mark.sampled(3)  # of the first and the fourth, one is blocked
 @pytest.mark.parametrize("number", range(6))
 def test_obstacles_are_those_that_coal_finds_along_the_way(number: int, tmp_path: Path) -> None:
     """Cupboards of a generator, with shapes, motions and distances of its own."""

@@ -13,6 +13,8 @@ from kineverse.errors import FormatError, InvalidValueError, ShapeError, Unknown
 from kineverse.view import Camera, picture, save_picture
 from kineverse.view.pictures import encode_png, write_png
 
+pytestmark = pytest.mark.usefixtures("fine_pictures")
+
 FRONT = Camera((-3.0, 0.3, 1.0), (0.0, 0.0, 0.5))
 SMALL = (160, 120)
 

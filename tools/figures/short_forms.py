@@ -26,8 +26,8 @@ DATA = Path(os.environ.get("KINEVERSE_TEST_DATA") or os.devnull).absolute()
 Tables = list[tuple[str, Table]]
 
 FIG4_CONFIGURATIONS = 20
-STREAMS, STREAM_SECONDS = 2, 45.0
-TYPE_CASES = 20
+STREAMS, STREAM_SECONDS = 1, 45.0
+TYPE_CASES = 12
 GRID_SAMPLES = 3
 LOCKBOXES = 20
 """Every ninth cell of the grid, with one sample."""
@@ -123,7 +123,7 @@ def sturm_statements() -> Tables:
 
 @cache
 def stream_tracking() -> Tables:
-    """Track two streams of 45 s."""
+    """Track a stream of 45 s."""
     from kineverse_studies.experiments.stream import make_report, make_streams, run_trackers
 
     model = kv.load("kitchen")
@@ -133,10 +133,10 @@ def stream_tracking() -> Tables:
 
 @cache
 def stream_monitoring() -> Tables:
-    """Monitor one stream of a minute of each kind."""
+    """Monitor one stream of half a minute of each kind."""
     from kineverse_studies.experiments.stream import measure_monitoring, monitoring_table
 
-    return tables_of(monitoring_table(measure_monitoring(kv.load("kitchen"), seeds=1, minutes=1.0)))
+    return tables_of(monitoring_table(measure_monitoring(kv.load("kitchen"), seeds=1, minutes=0.5)))
 
 
 @cache

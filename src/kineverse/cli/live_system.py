@@ -73,7 +73,7 @@ _BRIEF = ("*/sink_left_upper_drawer", "*/fridge_door", "*/oven_door")
 """Objects without a page, a drawer, a door and a flap, of the kitchen that ships."""
 _BRIEFLY = 0.4  # share of their ways by which they are opened
 _KINDS = ("drawer", "door", "flap")  # kinds of which one each is taken in another kitchen
-_DEADLINE = 84.0  # time from the start after which a run without a page ends [s]
+_DEADLINE = 80.0  # time from the start after which a run without a page ends [s]
 _INTERRUPTED = 130  # exit status after Ctrl-C, as of all commands
 _UNKNOWN = "unknown"  # behaviour that opens what nobody has described
 _SERVED, _TRUTH = "served.kv.json", "truth.kv.json"  # models of its run
@@ -114,7 +114,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--picture", metavar="PATH", help="write a picture (.png) of what was done at the end"
     )
     parser.add_argument(
-        "--seconds", type=float, metavar="S", help="end after this time (84 for the objects of --headless)"
+        "--seconds", type=float, metavar="S", help="end after this time (80 for the objects of --headless)"
     )
     parser.add_argument("--record", metavar="FILE", help="record all (.mcap), for kineverse view")
     parser.add_argument("--json", action="store_true", help="one JSON object on standard output")
@@ -531,8 +531,6 @@ class Screen:
         lines = [f"{SCHEME}{self._system.name}   {self._address}".rstrip()]
         lines += self._list_processes(status, width)
         lines += [join_lines(line) for line in describe_all(supervisor.reader)]
-        if status.activity is not None and status.activity.phase:
-            lines.append(f"phase: {join_lines(status.activity.phase)}")
         lines.append(self._answer or _KEYS)
         up = f"\033[{self._height}A" if self._height else ""
         text = "".join(f"\033[2K{shorten_text(line, width)}\n" for line in lines)

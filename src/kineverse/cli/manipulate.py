@@ -175,8 +175,13 @@ def _add_arguments(parser: argparse.ArgumentParser, skill: str) -> None:
         choices=("omni",),
         help="put a robot file without a base on one that moves in all directions",
     )
+    longest = 60.0 if skill == "push" else 120.0
     parser.add_argument(
-        "--seconds", type=float, default=60.0, metavar="S", help="largest time in the world (60)"
+        "--seconds",
+        type=float,
+        default=longest,
+        metavar="S",
+        help=f"largest time in the world ({longest:g})",
     )
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="seed of everything sampled (0)")
     parser.add_argument("--record", metavar="FILE", help="record the run (.mcap), for kineverse view")

@@ -43,6 +43,7 @@ from .plan_arguments import add_robot_option, include_robot
 
 if TYPE_CHECKING:
     from kineverse.model.model_view import ModelView
+    from kineverse.view.viewer import Viewer
 
 _NICENESS = 10  # of the page of a live system
 
@@ -60,7 +61,7 @@ examples:
   kineverse view                                 list of all models and articulations
   kineverse view my_robot.urdf --set elbow=45deg --port 8090
   kineverse view kitchen --robot fetch@0.45,0.7,90deg
-  kineverse view live:home                       follows the edits of a model that is served
+  kineverse view live:home                       a model that is served: its edits, and what moves there
   kineverse view kitchen --near 5cm              bodies within 5 cm of each other
   kineverse view articulations/ratchet --near 0.1 --collisions --picture ratchet.png
   kineverse view examples/arm.urdf --play arm.json   a trajectory of kineverse plan --save arm.json
@@ -165,16 +166,23 @@ def run(arguments: argparse.Namespace) -> int:
             play_recording(page, recording, time=arguments.time, **speed)
         elif trajectory is not None:
             page.play(trajectory, at=arguments.time, **speed)
-        if find_scheme(arguments.model) is not None and arguments.robot is None:
-            from kineverse.live import LivePage  # for start-up time
-
-            # Whoever controls the robot comes first; threads that are there answer the emergency stop.
-            os.nice(_NICENESS)
-            stack.enter_context(LivePage(page, model))
+        if find_scheme(arguments.model) is not None:
+            _show_streams(stack, page, model)
         print_address(page, browser=not arguments.no_browser)
         print(recording or model, flush=True)
         page.wait()
     return 0
+
+
+def _show_streams(stack: ExitStack, page: Viewer, model: ModelView) -> None:
+    """Show the streams beside a model that a server keeps, unless it is shown as a copy."""
+    from kineverse.exchange import LiveModel  # for start-up time
+    from kineverse.live import LivePage  # for start-up time
+
+    if isinstance(model, LiveModel):
+        # Whoever controls the robot comes first; threads that are there answer the emergency stop.
+        os.nice(_NICENESS)
+        stack.enter_context(LivePage(page, model))
 
 
 def _read_recording(arguments: argparse.Namespace) -> RunRecording | None:

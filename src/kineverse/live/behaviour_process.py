@@ -19,6 +19,7 @@ BEHAVIOURS: Mapping[str, Callable[..., Behaviour]] = {
     one.name: one for one in (Closer, Tour, OpenByName, CloseByName, OpenUnknown)
 }
 """Behaviours by name."""
+_LAST = 0.1  # time in which the last note arrives [s]
 _BEAT = 0.3  # time after which what is done is told again, as while a plan is made [s]
 
 
@@ -123,5 +124,7 @@ class BehaviourProcess:
         """Stop the robot, and end the stream."""
         self._is_over.set()
         self._beating.join()
+        self._put()
+        time.sleep(_LAST)  # a stream that ends takes with it what is on its way
         self._sessions.close()
         self._publisher.close()

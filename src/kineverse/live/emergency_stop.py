@@ -8,7 +8,6 @@ A stop that the world has not confirmed is asked for again, also after the world
 from __future__ import annotations
 
 import contextlib
-import threading
 import time
 from collections.abc import Callable
 from typing import Any, Final
@@ -29,7 +28,7 @@ STOP_PATH, RELEASE_PATH, STATE_PATH = "/robot/stop", "/robot/release", "/robot/s
 
 
 class RobotState(msgspec.Struct):
-    """What the button shows."""
+    """State of the robot, for the button."""
 
     robot: bool  # whether there is one at all
     stopped: str = ""  # why it takes no commands; empty if it does
@@ -39,37 +38,26 @@ class RobotState(msgspec.Struct):
 class EmergencyStop:
     """Emergency stop of the robot of a live system, for any number of browsers.
 
-    Parameters
-    ----------
-    reader
-        Reader of the streams. It reaches the world without the model server.
-
-    Attributes
-    ----------
-    wanted
-        Whether a stop was asked for that nobody has released.
+    The reader of the streams reaches the world without the model server. A stop is ``wanted`` until somebody
+    releases it.
     """
 
     def __init__(self, reader: StateReader) -> None:
-        self._reader, self._lock = reader, threading.Lock()
-        self.wanted = False
+        self._reader, self.wanted = reader, False
         self._is_confirmed, self._ticks, self._asked = False, 0, 0.0
         self._problem = ""
         self._rates: list[tuple[float, float]] = []  # time of a report, and frames a second of the browser
 
     def stop(self) -> RobotState:
         """Stop the robot; if the world does not answer, :meth:`watch` asks again."""
-        with self._lock:
-            self.wanted, self._is_confirmed = True, False
-        self._send_stop()
-        if self._is_confirmed:
+        self._is_confirmed, self.wanted = False, True
+        if self._send_stop():
             self._wait_until(lambda note: bool(note.stopped))
         return self.state
 
     def release(self) -> RobotState:
         """Let the robot take commands again."""
-        with self._lock:
-            self.wanted = False
+        self.wanted = False
         if self._ask("release"):
             self._wait_until(lambda note: not note.stopped)
         return self.state
@@ -77,20 +65,21 @@ class EmergencyStop:
     def watch(self) -> None:
         """Ask again for a stop that was not confirmed, or that a world started anew does not know."""
         note, age = self._read()
-        if note is None or not self.wanted:
+        if note is None or note.ticks < self._ticks:
+            self._is_confirmed = False
+        if note is None or age > _SILENT:
             return
-        began_anew = note.ticks < self._ticks
         self._ticks = note.ticks
-        if age > _SILENT or note.stopped:
-            self._is_confirmed = self._is_confirmed or bool(note.stopped)
-        elif self._is_confirmed and not began_anew:
+        if note.stopped:
+            self._is_confirmed = True
+        elif self._is_confirmed:
             self.wanted = False  # somebody else has released it
-        elif time.monotonic() - self._asked > _ANSWER / 2:
+        elif self.wanted and time.monotonic() - self._asked > _ANSWER / 2:
             self._send_stop()
 
     @property
     def state(self) -> RobotState:
-        """What is to be shown."""
+        """The state of the robot, which the button shows."""
         note, age = self._read()
         if note is None:
             return RobotState(self.wanted, problem="No robot is there." if self.wanted else "")
@@ -119,11 +108,9 @@ class EmergencyStop:
             self._rates = [*self._rates[-99:], (time.monotonic(), max(float(rate), 1.0))]
         return msgspec.json.encode(function()).decode()
 
-    def _send_stop(self) -> None:
+    def _send_stop(self) -> bool:
         self._asked = time.monotonic()
-        if self._ask("stop"):
-            note, _ = self._read()
-            self._is_confirmed, self._ticks = True, 0 if note is None else note.ticks
+        return self._ask("stop")
 
     def _ask(self, do: str) -> bool:
         try:

@@ -46,6 +46,7 @@ from .streams import (
 logger = logging.getLogger(__name__)
 
 _TABLE = 0.5  # time between two tables [s]
+_STOPPING = 0.1  # longest time between two looks after a stop was asked for [s]
 _UNWATCHED = 1.0  # time between two drawings while nobody looks [s]
 _SHOWN = (TRUTH, ROBOT, TRACKER)  # sources that place the bodies, the best first
 _DOUBLES = np.dtype(float).itemsize
@@ -53,7 +54,7 @@ _DOUBLES = np.dtype(float).itemsize
 
 @dataclass
 class StreamWorld:
-    """What the streams tell of the true world, for :class:`.LiveRun`."""
+    """True world as far as streams tell of it, for :class:`.LiveRun`."""
 
     state: Mapping[str, float] = field(default_factory=dict)
 
@@ -67,10 +68,10 @@ class StreamStep:
     """Step that the streams tell of, as :class:`.SkillStep`."""
 
     time: float
-    phase: str
     state: Mapping[str, float]  # the believed one
     vectors: Mapping[str, tuple[Array, Array]]
     reference: Any  # way and pose of the hand, as ``ahead`` and ``pose``
+    phase: str = ""  # which stands with what else is done
     contact: None = None
     commands: Mapping[Any, float] = field(default_factory=dict)
     observation: Observation = field(default_factory=lambda: Observation(0.0, {}))
@@ -100,7 +101,7 @@ def read_step(reader: StateReader, truth: Mapping[str, float], begin: float) -> 
     known = {name: (ends[0], ends[1]) for name, ends in vectors.items() if ends is not None}
     way, wanted = _as_array(activity.way, (-1, 3)), _as_array(activity.wanted, (4, 4))
     reference = SimpleNamespace(ahead=way, pose=wanted)
-    return StreamStep(latest - begin, activity.phase, belief, known, reference)
+    return StreamStep(latest - begin, belief, known, reference)
 
 
 def _as_array(data: bytes, shape: tuple[int, int]) -> Array | None:
@@ -178,6 +179,7 @@ class LivePage(Closing):
             rate = self.stop.slowest_rate
             # As much time is left to others as the drawing has taken.
             due = max(PERIOD, 1.0 / rate if rate else _UNWATCHED, time.monotonic() - begin)
+            due = min(due, _STOPPING) if self.stop.wanted else due
 
     def step(self) -> bool:
         """Draw what is newest; return False if there is nothing, or a browser has not taken the last one."""

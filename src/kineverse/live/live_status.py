@@ -1,4 +1,4 @@
-"""What people read of a live system: its processes with the age of their news, and what is done and why."""
+"""Text about a live system for people: its processes and the age of their news, and what is done and why."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ A camera that sees nothing, and a robot that nobody moves, are silent rightly.
 
 SERVER: Final = "serve"
 _UNSEEN = 3.0  # time for which a coordinate may be unseen before it is said [s]
-_MOST_NAMES = 3
+_MOST_NAMES, _MOST_RESULTS = 3, 3
 
 
 class ProcessStatus(NamedTuple):
@@ -71,16 +71,8 @@ def list_processes(
 ) -> list[ProcessStatus]:
     """Return the processes of a live system.
 
-    Parameters
-    ----------
-    ages
-        Time since the newest vector of each source that is there [s].
-    supervisor
-        What the supervisor says; None without any.
-    known
-        Sources that were there before; those that are there no longer are gone.
-    is_online
-        Whether the model server answers.
+    They are told by the ages of the sources that are there [s], and by the supervisor, if there is one. Of
+    the known sources, those that are there no longer are gone. The model server is online if it answers.
     """
     rows = {} if supervisor is None else {row.name: row for row in supervisor.rows}
     found = []
@@ -122,9 +114,13 @@ def describe_activity(note: ActivityNote | None) -> list[str]:
         return ["nothing is done: no behaviour is there"]
     lines = [f"{note.behaviour}: {note.doing}" if note.doing else note.behaviour]
     lines += [f"why: {note.why}"] if note.why else []
+    lines += [f"phase: {note.phase}"] if note.phase else []
     if note.done or note.failed:
         lines.append(f"so far {note.done} done, {note.failed} failed")
-    return lines + ([f"last: {note.last}"] if note.last else [])
+    for result in reversed(note.results[-_MOST_RESULTS:]):
+        ended = "done" if result.done else f"failed, {result.reason}"
+        lines.append(f"{result.skill} {result.what}: {ended} ({result.seconds:.0f} s)")
+    return lines + ([f"last: {note.last}"] if note.last and not note.results else [])
 
 
 def describe_robot(robot: RobotNote | None, activity: ActivityNote | None = None) -> list[str]:

@@ -1,4 +1,4 @@
-"""What people do to a live system: they move furniture, hide markers, add noise, and cut processes."""
+"""Acts of people on a live system: they move furniture, hide markers, add noise, and cut processes."""
 
 from __future__ import annotations
 
@@ -43,17 +43,7 @@ FREEZE: Final = 1.0  # time for which a process is frozen [s]
 class Place:
     """Place of a piece of furniture: x, y [m] and an angle about z [rad] in the world, as an edit changes it.
 
-    Parameters
-    ----------
-    model
-        Model in which the piece stands by a fixed joint.
-    frame
-        Its frame, one of :func:`list_furniture`.
-
-    Raises
-    ------
-    UnknownNameError
-        For a frame that is none of these.
+    The frame is one of :func:`list_furniture`; any other is an UnknownNameError.
     """
 
     def __init__(self, model: ModelView, frame: str) -> None:
@@ -98,13 +88,7 @@ def list_furniture(model: ModelView, robot: Collection[str] = ()) -> dict[str, s
 
 
 def move_furniture(live: LiveModel, frame: str, x: float, y: float, angle: float) -> None:
-    """Put a piece of furniture elsewhere by an edit of the served model [m], [rad].
-
-    Raises
-    ------
-    KineverseError
-        If it is refused, or the server is away.
-    """
+    """Put a piece of furniture elsewhere by an edit of the served model [m], [rad]."""
 
     def change(edit: Edit) -> None:
         (*_, tag) = live.history.writers(f"frames/{frame}")
@@ -119,13 +103,7 @@ def find_carried(model: ModelView, coordinate: Symbol) -> list[str]:
 
 
 def find_process(reader: StateReader, name: str) -> ProcessRow:
-    """Return a process that the supervisor has told of just now.
-
-    Raises
-    ------
-    UnknownNameError
-        If there is none of that name.
-    """
+    """Return a process that the supervisor has told of just now; any other is an UnknownNameError."""
     note, age = read_note(reader, SUPERVISOR, SupervisorNote), reader.age.get(SUPERVISOR, math.inf)
     rows = {} if note is None or age > PATIENCE[SUPERVISOR] else {row.name: row for row in note.rows}
     row = rows.get(name)
@@ -137,12 +115,7 @@ def find_process(reader: StateReader, name: str) -> ProcessRow:
 def cut_process(reader: StateReader, name: str, freeze: bool = False) -> None:
     """Kill a process of the live system, or freeze it for a second.
 
-    Raises
-    ------
-    UnknownNameError
-        If the supervisor does not tell of it.
-    KineverseError
-        If it is gone, or belongs to somebody else.
+    One that the supervisor does not tell of is an UnknownNameError, one that is gone a KineverseError.
     """
     pid = find_process(reader, name).pid
     try:
@@ -163,12 +136,9 @@ def _continue(pid: int) -> None:
 
 
 class Errands:
-    """Thread that does what people ask for, of each kind the newest only, and tells how it went.
+    """Thread that does what people ask for, of each kind the newest only.
 
-    Parameters
-    ----------
-    tell
-        Function that gets a line, and whether it was refused.
+    How it went is told to a function: a line, and whether it was refused.
     """
 
     def __init__(self, tell: Callable[[str, bool], None]) -> None:

@@ -33,13 +33,14 @@ _ALL = "all"
 
 @dataclass(frozen=True)
 class Choices:
-    """What there is to choose from in a version of a model."""
+    """Things to choose from in a version of a model."""
 
     moved: Mapping[str, tuple[float, float]] = field(
         default_factory=dict
     )  # limits of furniture's coordinates
     units: Mapping[str, str] = field(default_factory=dict)
     carried: Mapping[str, Sequence[str]] = field(default_factory=dict)  # frames by the coordinate
+    frames: Sequence[str] = ()  # all that are not the robot's
     places: Mapping[str, Place] = field(default_factory=dict)
 
     @classmethod
@@ -53,22 +54,13 @@ class Choices:
             {str(s): choose_slider_range(model.limits(s), values[str(s)], "") for s in free},
             infer_units(model, values, names),
             {str(s): find_carried(model, s) for s in free},
+            [name for name in model.frames if name not in owned],
             {name: Place(model, name) for name in list_furniture(model, owned)},
         )
 
 
 class PeoplePanel:
-    """Controls by which people move things, hide markers, add noise, cut processes, and accept proposals.
-
-    Parameters
-    ----------
-    gui
-        Controls of the page.
-    live
-        The served model.
-    reader
-        Reader of its streams.
-    """
+    """Controls by which people move things, hide markers, add noise, cut processes, and accept proposals."""
 
     def __init__(self, gui: Any, live: LiveModel, reader: StateReader) -> None:
         self._gui, self._live, self._reader = gui, live, reader
@@ -200,9 +192,8 @@ class PeoplePanel:
             self._ask_world("noise", f"noise: {name}", text=NOISES[name])
 
     def _hide(self, name: str) -> None:
-        carried = self._choices.carried
-        everything = sorted({frame for frames in carried.values() for frame in frames})
-        frames = everything if name == _ALL else list(carried.get(name, ()))
+        choices = self._choices
+        frames = [*choices.frames] if name == _ALL else [*choices.carried.get(name, ())]
         self._ask_world("hide", f"hidden: {name}" if frames else "nothing is hidden", frames=frames)
 
     def _cut(self, freeze: bool) -> None:

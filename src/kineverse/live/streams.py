@@ -14,6 +14,7 @@ import msgspec
 import numpy as np
 
 from kineverse.errors import KineverseError
+from kineverse.exchange.protocol import encode as encode
 from kineverse.exchange.state import StateReader
 from kineverse.lie import Array
 
@@ -177,11 +178,6 @@ class Answer(msgspec.Struct):
 
 Note = TypeVar("Note")
 Handler: TypeAlias = Callable[..., Any]
-
-
-def encode(note: object) -> bytes:
-    """Return a note as bytes."""
-    return msgspec.msgpack.encode(note)
 
 
 def decode(data: bytes, kind: type[Note]) -> Note | None:

@@ -52,7 +52,7 @@ class TrackerProcess:
         self._symbols = self._list_symbols()
         self._reader = live.exchange.reader()
         self._publisher = live.exchange.publisher(TRACKER, self._symbols)
-        self._picture, self._stamp = -1, 0.0
+        self._picture, self._stamp, self._ticks = -1, 0.0, 0
 
     def _make(self, model: ModelView) -> TrackedBelief:
         belief = TrackedBelief(model, self._robot, self._sensors)
@@ -94,7 +94,7 @@ class TrackerProcess:
         if newest is None or note is None or newest.stamp <= self._stamp:
             return False
         self._follow()
-        self._stamp = newest.stamp
+        before, self._stamp = self._stamp, newest.stamp
         model, poses, seen = self.belief.model, {}, None
         known = {str(s): s for s in self._symbols}
         named = zip(newest.names, newest.values.tolist(), strict=True)
@@ -106,18 +106,26 @@ class TrackerProcess:
                 self._picture, seen = shown.picture, picture.stamp
                 poses = {name: pose for name, pose in shown.read().items() if name in model.frames}
         observation = Observation(newest.stamp, joints, poses, frozenset(note.touching), seen)
-        state = self.belief.update(observation, newest.stamp, self._read_commands())
+        state = self.belief.update(observation, newest.stamp, self._read_commands(before, newest.stamp, note))
+        self._ticks = note.ticks
         self._publish(state, newest.stamp, 1e3 * (time.perf_counter() - begin))
         return True
 
-    def _read_commands(self) -> State | None:
-        """Return the speeds that act, and those planned for objects; None if nobody commands any."""
+    def _read_commands(self, begin: float, end: float, robot: RobotNote) -> State | None:
+        """Return the mean speeds over a time [s], and those planned for objects; None if nobody commands any.
+
+        A world that was held up has left ticks out, and a command acts no longer than the world's time-out
+        after the state that it is from.
+        """
         newest = self._reader.newest(COMMANDS)
         note = None if newest is None else decode(newest.note, CommandNote)
-        if newest is None or note is None or time.monotonic() - newest.arrival > note.duration + 2 * TICK:
+        if newest is None or note is None or robot.stopped:
             return None
+        moved = (robot.ticks - self._ticks) * TICK
+        acted = newest.stamp + (robot.timeout if note.stamped else note.duration) - begin
+        share = min(1.0, max(0.0, min(moved, acted) / (end - begin)))
         values = dict(zip(newest.names, newest.values.tolist(), strict=True)) | note.planned
-        return State({Symbol(*parse_symbol_name(name)): value for name, value in values.items()})
+        return State({Symbol(*parse_symbol_name(name)): share * value for name, value in values.items()})
 
     def _publish(self, state: State, stamp: float, milliseconds: float) -> None:
         deviations = np.array([self.belief.deviation(s) for s in self._symbols])
@@ -130,10 +138,9 @@ class TrackerProcess:
         """Go on with the tracker of an edited model, once it is made."""
         if self._follower.version == self._version:
             return
-        before = self.belief.tracker.estimate.state
+        before = self.belief
         self.belief, self._version = self._follower.current
-        tracker = self.belief.tracker
-        tracker.reset({s: before[s] for s in tracker.symbols if s in before}, at=self._stamp)
+        self.belief.take_over(before)
         symbols = self._list_symbols()
         if symbols != self._symbols:
             self._symbols = symbols

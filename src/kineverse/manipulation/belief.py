@@ -268,15 +268,29 @@ class TrackedBelief:
         horizon = min(time, observation.stamp + self.sensors.delay + _HORIZON)
         return self._predict(horizon)
 
+    def take_over(self, other: TrackedBelief) -> None:
+        """Begin with what another one believes, of another version of the model: values, and when seen.
+
+        They have the deviation of what was never seen, until they are seen.
+        """
+        before = other.tracker.estimate.state
+        values = dict(self.tracker.estimate.state)
+        values |= {s: before[s] for s in self.tracker.symbols if s in before}
+        self._estimate = self.tracker.reset(values, at=other.tracker.estimate.state.stamp or 0.0)
+        for symbol, place in self._place.items():
+            if symbol in other._place:
+                self._values[place] = other._values[other._place[symbol]]
+        self.seen = {s: at for s, at in other.seen.items() if s in self._place}
+
     def _begin(self, stamp: float) -> None:
         """Start again at a time, with objects where they were believed."""
         self.tracker.wait()  # each update before would take a hundred times as long
         if not math.isinf(self._now):
             self._estimate = self.tracker.reset(dict(self.tracker.estimate.state), at=stamp)
+            self.seen.clear()
         self._history.clear()
         self._moved.clear()
         self._refuted.clear()
-        self.seen.clear()
         self._now = self._read = self._looked = -math.inf
         self._picture = stamp
 

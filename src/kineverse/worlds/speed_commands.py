@@ -53,12 +53,10 @@ class SpeedCommands:
 
     def take_over(self, other: SpeedCommands) -> None:
         """Go on with the commands of another world, whose robot has the same speeds or some of them."""
-        both = [
-            (mine, theirs)
-            for name, mine in self._columns.items()
-            if isinstance(name, str) and mine is not None and (theirs := other._columns.get(name)) is not None
-        ]
-        mine, theirs = np.array(both, dtype=int).reshape(-1, 2).T
+        names = [n for n, k in self._columns.items() if k is not None and other._columns.get(n) is not None]
+        mine, theirs = (
+            np.array([columns[n] for n in names], dtype=int) for columns in (self._columns, other._columns)
+        )
 
         def carry(command: _Command) -> _Command:
             vector = np.zeros(len(self._fingers))

@@ -25,7 +25,7 @@ from typing import Any
 
 import numpy as np
 
-from kineverse.errors import KineverseError, OfflineError
+from kineverse.errors import KineverseError, OfflineError, UnknownNameError
 from kineverse.formats import load
 from kineverse.live.streams import (
     ACTIVITY,
@@ -71,8 +71,8 @@ class LiveJob:
 
 
 @dataclass
-class LiveRun:
-    """What was measured of an object that was opened and closed in real time."""
+class RealTimeRun:
+    """Measures of an object that was opened and closed in real time."""
 
     robot: str
     thing: str
@@ -148,10 +148,10 @@ def _started(words: Sequence[str], output: Path, **options: Any) -> Iterator[sub
         process.wait()
 
 
-def run_processes(job: LiveJob) -> LiveRun:
+def run_processes(job: LiveJob) -> RealTimeRun:
     """Open and close an object by a live system of processes."""
     what = f"{OBJECT}/{job.thing.coordinate}"
-    found = LiveRun(job.robot, job.thing.name, wanted=2 * job.rounds)
+    found = RealTimeRun(job.robot, job.thing.name, wanted=2 * job.rounds)
     with ExitStack() as stack:
         folder = Path(stack.enter_context(TemporaryDirectory(prefix="kv-")))
         model, output = folder / "object.kv.json", folder / "output"
@@ -177,7 +177,7 @@ def run_processes(job: LiveJob) -> LiveRun:
     return found
 
 
-def _watch(found: LiveRun, process: subprocess.Popen[bytes], what: str) -> None:
+def _watch(found: RealTimeRun, process: subprocess.Popen[bytes], what: str) -> None:
     """Measure a live system by its streams until it ends."""
     live = _connect(process)
     upper = float(live.limits(what)[1])
@@ -210,16 +210,16 @@ def _watch(found: LiveRun, process: subprocess.Popen[bytes], what: str) -> None:
 def _connect(process: subprocess.Popen[bytes]) -> Any:
     end = time.monotonic() + _STARTING
     while process.poll() is None and time.monotonic() < end:
-        with suppress(OfflineError):
+        with suppress(OfflineError, UnknownNameError):
             return load(f"live:{NAME}")
         time.sleep(0.2)
     raise KineverseError(f"The live system was not there within {_STARTING:g} s, or has ended.")
 
 
-def run_topics(job: LiveJob) -> LiveRun:
+def run_topics(job: LiveJob) -> RealTimeRun:
     """Open and close an object with a robot that is only topics of ROS 2, by a command for each."""
     what = f"{OBJECT}/{job.thing.coordinate}"
-    found = LiveRun(job.robot, job.thing.name, wanted=2 * job.rounds)
+    found = RealTimeRun(job.robot, job.thing.name, wanted=2 * job.rounds)
     python = os.environ.get("KINEVERSE_ROS_PYTHON", sys.executable)
     with ExitStack() as stack:
         folder = Path(stack.enter_context(TemporaryDirectory(prefix="kv-")))
@@ -278,7 +278,9 @@ def _run_lock_step(
 # -- what is reported ----------------------------------------------------------------------------------------
 
 
-def _make_report(runs: list[LiveRun], lock_step: list[tuple[str, list[Trial]]], options: Options) -> Report:
+def _make_report(
+    runs: list[RealTimeRun], lock_step: list[tuple[str, list[Trial]]], options: Options
+) -> Report:
     columns = {
         "robot": lambda one: one.robot,
         "object": lambda one: one.thing,
@@ -310,7 +312,7 @@ def _filled(tables: Sequence[ReportTable]) -> tuple[ReportTable, ...]:
     return tuple(table for table in tables if table.rows)
 
 
-def _draw(runs: list[LiveRun]) -> Figure:
+def _draw(runs: list[RealTimeRun]) -> Figure:
     def draw(canvas: Any) -> None:
         axes = canvas.add_subplot()
         names = [f"{one.robot}, {one.thing}" for one in runs]

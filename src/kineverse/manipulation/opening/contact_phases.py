@@ -77,6 +77,12 @@ class Way:
         return float(self.values[-1, -1])
 
     @property
+    def corners(self) -> tuple[int, ...]:
+        """Indices of the rows at which one coordinate has arrived before another one moves."""
+        moving = np.diff(self.values, axis=0) != 0.0
+        return tuple((np.flatnonzero((moving[1:] != moving[:-1]).any(axis=1)) + 1).tolist())
+
+    @property
     def last_run(self) -> int:
         """Index of the row from which on the object's coordinate moves alone."""
         others = self.values[:, :-1]
@@ -107,7 +113,7 @@ class ContactPhase:
     coordinate, target
         The coordinate that moves last, and its value at the end [m], [rad].
     tolerance
-        Largest distance from there that passes the threshold of a lock [m], [rad]; infinite without one.
+        Largest distance from there that passes the threshold of a lock [m], [rad]; None without one.
     handle
         What is held; None if the part is pressed.
     way
@@ -116,7 +122,7 @@ class ContactPhase:
 
     coordinate: Symbol
     target: float
-    tolerance: float
+    tolerance: float | None
     handle: Handle | None
     way: Way
 
@@ -192,6 +198,15 @@ class PhasePlanner:
         way = Way.straight(first.coordinate, state[first.coordinate], first.target)
         return ContactPhase(first.coordinate, first.target, tolerance, handle, way)
 
+    def latches(self, state: State, target: float) -> bool:
+        """Return True if the object does not move back from a target unless something unlatches it."""
+        if not self.has_keys:
+            return False
+        default = self._model.default_state()
+        there = state.updated({s: default[s] for s in self._objects} | {self.coordinate: target})
+        plan = self._plan(there, float(state[self.coordinate]), ())
+        return plan.verdict == "found" and any(step.coordinate != self.coordinate for step in plan.steps)
+
     def find_straight(self, state: State, target: float) -> Way:
         """Return the way on which the object alone moves."""
         here = state[self.coordinate]
@@ -208,7 +223,7 @@ class PhasePlanner:
         order = (*(s for s in own if s != last), last)
         if {step.coordinate for step in group} <= {last}:
             way = Way.straight(last, state[last], end, {s: state[s] for s in order})
-            return ContactPhase(last, end, math.inf, self._handle, way)
+            return ContactPhase(last, end, None, self._handle, way)
         at = {s: float(state[s]) for s in order}
         corners = [[*at.values()]]
         for step in group:
@@ -217,7 +232,7 @@ class PhasePlanner:
             if step is group[-1]:
                 corners += self._let_back(surely, at, before, target)
             corners.append([*at.values()])
-        return ContactPhase(last, end, math.inf, self._handle, Way.through(order, corners))
+        return ContactPhase(last, end, None, self._handle, Way.through(order, corners))
 
     def _let_back(
         self, state: State, end: dict[Symbol, float], before: float, target: float
@@ -253,6 +268,6 @@ class PhasePlanner:
         return [s for s in self._objects if s in moving]
 
 
-def _find_tolerance(step: UnlockingStep) -> float:
-    threshold = step.target if step.threshold is None else step.threshold
-    return _SHARE * abs(step.target - threshold) or math.inf
+def _find_tolerance(step: UnlockingStep) -> float | None:
+    passed = 0.0 if step.threshold is None else abs(step.target - step.threshold)
+    return _SHARE * passed if passed else None

@@ -35,6 +35,7 @@ from .planned_push import LEAST_PUSH, PlannedPush, press
 _SLANT = math.radians(50.0)  # largest slant of grasps where those from across the handle lead nowhere [rad]
 _PROOF = 200  # largest number of sampled bases that are to prove that an object is too high
 _MOST_GRASPS, _MOST_PUSHES, _MOST_PHASES = 4, 3, 8
+_LATCHED = 5e-4  # distance from where something latches at which it is let go [m], [rad]
 _LATE = 1.0  # time before the end at which it counts as up [s]
 _MOST_SLIPS, _LEAST_PROGRESS = 2, 0.1
 """Number of slips from which on a grasp has to take an object further, by a share of the rest."""
@@ -139,7 +140,7 @@ class OpeningRun(SkillRun):
         self.motion = HandMotion(self, opener, handle, seed, self.phases.carriers)
         self._stuck: dict[Symbol, str] = {}  # what did not move when it should have, and why
         self._wanted = target, tolerance
-        self.target = self.tolerance = math.nan
+        self.target = self.tolerance = self.near = math.nan
         self._samples, self._seed = placements, seed
         self.pushed_from: float | None = None
         self.slips: list[str] = []
@@ -202,6 +203,8 @@ class OpeningRun(SkillRun):
             raise SkillError("other", fixed)
         self.target = choose_target(model, coordinate, state, target)
         self.tolerance = choose_tolerance(model, coordinate, state, self.target, tolerance)
+        latches = self.phases.latches(state, self.target)
+        self.near = min(self.tolerance / 4, _LATCHED) if latches else self.tolerance / 4
         self.measures |= {"target": self.target, "tolerance": self.tolerance}
         self.check_way(self.target)
 
@@ -262,7 +265,7 @@ class OpeningRun(SkillRun):
         before, stall = self.rest, None
         try:
             if self.motion.close(placement.grasp):
-                move_held(self.motion, placement, self.tolerance)
+                move_held(self.motion, placement, self.tolerance, self.near)
                 self._note_unlatched(*placement.way.keys)
                 self.session.made.append(placement.find_last_run())
         except SlipError as slip:

@@ -439,11 +439,12 @@ _STALLED, _PATIENCE, _RESTING = 1e-3, 4.0, 0.5  # least progress [m], [rad] in a
 _LOCKED, _STANDING = 1.5, 1e-3
 """Time [s] after which an object that has not moved yet is not waited for, if the controller plans no speed
 beyond some [m/s], [rad/s] for it either: its own constraints hold it."""
+_AT_CORNER = 0.03  # distance from a corner of a way at which that counts as passed [m], [rad]
 _STEPS_AT_TARGET = 10  # number of steps for which an estimate is at the target when a motion ends
 
 
-def move_held(motion: HandMotion, placement: BasePlacement, tolerance: float) -> None:
-    """Move a held object along the path of a placement."""
+def move_held(motion: HandMotion, placement: BasePlacement, tolerance: float, near: float) -> None:
+    """Move a held object along the path of a placement, near to its end, or to rest within a tolerance."""
     bar, hand = motion.bar, motion.hand
     session, way, grasp = motion.session, placement.way, placement.grasp
     assert grasp is not None
@@ -474,13 +475,14 @@ def move_held(motion: HandMotion, placement: BasePlacement, tolerance: float) ->
     share, pace = 0.0, Pace(session, _LATE)
     length = float(np.abs(np.diff(way.values, axis=0)).max(axis=1).sum())
     best, since = 0.0, session.time
+    corners = deque(k / (len(way) - 1) for k in way.corners)
     controller.set(grasped, held)
     controller.set(arm_speeds, np.zeros(len(moving)))  # the path waits for the arm
     motion.refer([bar(session.state.updated(way.at(k))) @ held for k in range(len(way))])
     within, enough = 0, _STEPS_AT_TARGET if session.deviation(coordinate) else 1
     while True:
         rest = abs(session.state[coordinate] - target)
-        there = rest <= tolerance / 4 and (share == 1.0 or len(coordinates) == 1)
+        there = rest <= near and (share == 1.0 or len(coordinates) == 1)
         within = within + 1 if there else 0
         if within >= enough:
             return
@@ -493,17 +495,23 @@ def move_held(motion: HandMotion, placement: BasePlacement, tolerance: float) ->
             command = controller.step(state)
             # The reference waits for the slowest joint.
             arm = np.abs(reference - state.vector(moving)).max(initial=0.0)
-            off = np.abs(place - state.vector(coordinates))
-            late = max(float(arm), float(off.max()))
+            here = state.vector(coordinates)
+            off = np.abs(place - here)
+            # What a spring takes back is not waited for where it is let back anyway.
+            after = np.abs(row_at(way.values, min(1.0, share + 1.0 / (len(way) - 1))) - here)
+            late = max(float(arm), float(np.minimum(off, after).max()))
         motion.refer_to(share)
         motion.run.act(command.speeds, command)
         passed = share * length
-        share = min(1.0, share + pace.advance(late) * _SPEED / length)
+        share = min(corners[0] if corners else 1.0, share + pace.advance(late) * _SPEED / length)
         slip.check()
         done = passed - float(np.abs(place - session.state.vector(coordinates)).max())
         if done > best + _STALLED:
             best, since = done, session.time
         resting = session.time - since
+        if corners and share == corners[0] and (off.max() < _AT_CORNER or resting > _RESTING):
+            corners.popleft()
+            pace = Pace(session, _LATE)
         if share == 1.0 and rest < 0.75 * tolerance and resting > _RESTING:
             return
         planned = max(abs(float(command.speeds.get(s.derivative(), np.inf))) for s in coordinates)
