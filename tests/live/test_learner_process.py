@@ -30,8 +30,14 @@ class Live:
     def show(self, poses):
         """Publish a picture, and have the learner take it."""
         self.number += 1
-        self.source.put((), self.camera.time, encode(CameraNote.make(self.number, poses)))
-        self._wait(self.learner.take)
+        note = encode(CameraNote.make(self.number, poses))
+
+        def is_taken():  # what comes before somebody listens is lost
+            self.source.put((), self.camera.time, note)
+            self.reader.wait(0.005)
+            return self.learner.take()
+
+        self._wait(is_taken)
 
     def look(self, seconds, door=lambda t: 0.0):
         """Show pictures for a time of the camera [s]."""

@@ -46,7 +46,7 @@ class LearnerProcess:
         self._pictures: deque[tuple[float, Mapping[str, Array]]] = deque(maxlen=_KEPT)
         self._wishes: deque[str] = deque()
         self._news = threading.Event()
-        self._note = LearnerNote(problem="No picture has come in yet.")
+        self._note = LearnerNote()
         self._picture, self._arrival, self._known = -1.0, time.monotonic(), False
         self._waits, self._try_again = "", 0.0
         self._is_closed = False
