@@ -294,7 +294,7 @@ class Microwave(SprungDoor, document_kind="Microwave"):
         if not ajar > self.play:
             raise InvalidValueError(
                 f"The spring of the door of the {self.noun} '{self.name}' opens it beyond the play "
-                f"{self.play:g}, and not to {ajar:g}."
+                f"{self.play:g}; with its rest at {self.door_rest:g} and its friction it stops at {ajar:g}."
             )
 
     def dynamics(self) -> tuple[tuple[str, Any], ...]:
