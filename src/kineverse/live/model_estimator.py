@@ -34,9 +34,8 @@ from .marker_tracks import REST, MarkerTracks
 from .streams import LearnerNote, ProposalRow, WatchedPart
 
 _PERIOD = 0.3  # time between two fits of a joint [s]
-_HELD_BACK = (
-    0.3  # time for which a pose is kept until it is certain that what carries its part stood still [s]
-)
+_HELD_BACK = 0.5  # time for which a pose waits until it is certain that what carries its part stood still [s]
+_STILL = 0.01  # motion of a part that is back where it was [m]
 _CARRIED = 1.0  # time between a motion of what carries a part and poses of it that count [s]
 _NEAR, _TURNED = (
     0.12,
@@ -49,6 +48,7 @@ _BETTER = 0.5  # share of the deviation of a written joint that a better one has
 _EXACT = 2e-3  # deviation of a joint that needs no better one [m]
 _EDITS = 1.0  # shortest time between two edits of a joint [s]
 _MOVED, _OFF = 0.02, math.radians(1.5)  # motion of furniture that is proposed [m], [rad]
+_STANDS = 20.0  # poses of furniture at rest from which on it stands somewhere
 _WATCHED, _TESTED = (
     3.0,
     2,
@@ -259,6 +259,9 @@ class ModelEstimator:
         ):
             pose = self._relate(part.parent) @ tracks.smoothed(part.frame)
             part.way, part.turn = measure_way(part.start, pose, np.zeros(3))
+            if part.learning.learned is None and part.distance < _STILL:
+                # It was carried along, and what carries it was seen to move a little later.
+                part.learning, part.offered = JointLearning(), 0
         if part.learning.poses < _FEWEST or now - part.fitted < _PERIOD:
             return
         part.fitted = now
@@ -367,10 +370,12 @@ class ModelEstimator:
         If most of it does, the robot is not where it takes itself to be, and nothing is proposed.
         """
         tracks = self.tracks
-        seen = [f for f in self._furniture if tracks.is_known(f) and self._now - tracks.seen(f) < _AWAY]
+        now, furniture = self._now, self._furniture
+        there = [f for f in furniture if tracks.is_known(f) and now - tracks.seen(f) < _AWAY]
+        seen = [f for f in there if tracks.rests(f) and tracks.weight(f) >= _STANDS]
         moved = {}
         for frame in seen:
-            away, turned = measure_way(self._furniture[frame], tracks.smoothed(frame), np.zeros(3))
+            away, turned = measure_way(furniture[frame], tracks.smoothed(frame), np.zeros(3))
             if away > _MOVED or turned > _OFF:
                 moved[frame] = away, turned
         lost = len(moved) > 1 and 2 * len(moved) > len(seen)
@@ -384,7 +389,7 @@ class ModelEstimator:
             away, turned = moved[frame]
             words = f"'{frame}' stands {100 * away:.0f} cm and {math.degrees(turned):.0f}° from where it was"
             self.alarms[tag] = f"{words}, as does other furniture; is the robot elsewhere?" if lost else words
-            if lost or not tracks.rests(frame) or tracks.weight(frame) < 20.0:
+            if lost:
                 self.proposals.pop(tag, None)
             elif (earlier := self.proposals.get(tag)) is None or self._now - earlier.since < self._settling:
                 self._propose(self._place(frame, words))
