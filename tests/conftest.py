@@ -36,7 +36,6 @@ from native_libraries import compile_native_libraries
 ROOT = Path(__file__).parents[1]
 sys.path.append(str(ROOT / "examples"))  # living_kitchen
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
-FINE = 2  # computed pixels along the edge of one of a picture
 ROS_PYTHON = Path(sys.prefix, "ros", "bin", "python")  # of wheels, with the packages of this environment
 
 # No test depends on the load of the machine.
@@ -44,7 +43,7 @@ settings.register_profile(
     "kineverse",
     deadline=None,
     suppress_health_check=[HealthCheck.too_slow],
-    max_examples=45,
+    max_examples=36,
     derandomize=bool(os.environ.get("CI")),
 )
 settings.register_profile(
@@ -186,23 +185,23 @@ def _models_are_remembered() -> Generator[None]:
 
 
 @pytest.fixture(scope="session", autouse=True)
-def _pictures_are_coarse() -> Generator[None]:
-    """A picture has a computed pixel for each of its own, a quarter of the usual work."""
+def _usual_samples() -> Generator[int]:
+    """Pictures have a computed pixel for each of their own, a quarter of the usual work; return the usual number."""
     from kineverse.view import pictures
 
     before, pictures.SAMPLES = pictures.SAMPLES, 1
-    yield
+    yield before
     pictures.SAMPLES = before
 
 
 @pytest.fixture(scope="module")
-def fine_pictures() -> Generator[None]:
+def fine_pictures(_usual_samples: int) -> Generator[None]:
     """Pictures are as fine as those of users."""
     from kineverse.view import pictures
 
-    before, pictures.SAMPLES = pictures.SAMPLES, FINE
+    pictures.SAMPLES = _usual_samples
     yield
-    pictures.SAMPLES = before
+    pictures.SAMPLES = 1
 
 
 @pytest.fixture(scope="session")

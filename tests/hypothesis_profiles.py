@@ -1,4 +1,4 @@
-"""How often a law is tried: as often as `make test` has time for, or 22 times as often with --hypothesis-profile=thorough."""
+"""How often a law is tried: as often as `make test` has time for, or 28 times as often with --hypothesis-profile=thorough."""
 
 from __future__ import annotations
 

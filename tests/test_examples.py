@@ -22,7 +22,13 @@ SCRIPTS = sorted(FOLDER.glob("[0-9][0-9]_*.py"))
 PUBLISHED = [s for library in ("pink", "mink") for s in sorted((FOLDER / f"from_{library}").glob("*.py"))]
 LARGE = ("biped_cassie", "humanoid_g1_teleop")
 """Examples that take seconds to build; ``kineverse bench examples`` runs them."""
-CONTROL = [script for script in PUBLISHED if script.stem not in LARGE]
+SLOW = ("humanoid_g1_com", "flying_dual_arm_ur3")
+"""Examples that take more than a second each."""
+CONTROL = [
+    pytest.param(script, marks=pytest.mark.long) if script.stem in SLOW else script
+    for script in PUBLISHED
+    if script.stem not in LARGE
+]
 
 EXPECTED = {
     "01_load_and_view": "54 frames, 23 DoF, 46 constraints (version 1)\n...",

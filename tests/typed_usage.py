@@ -1,4 +1,4 @@
-"""What a type checker has to say about a user's code; ``test_types`` runs both it and the code."""
+"""What a type checker has to say about a user's code: mypy checks it with the package, ``test_typing`` runs it."""
 
 import contextlib
 from typing import Any, assert_type

@@ -107,6 +107,7 @@ def test_ball_velocity_limits_the_norm_of_the_angular_velocity() -> None:
     assert not model_of(kv.articulations.Ball(**WHERE, velocity=inf)).constraints
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("wish", [(1, 0, 0), (0, -1, 0), (0.3, 0.5, 1), (0, 0, -1)])
 def test_velocity_rows_keep_cone_twist_and_speed(wish: tuple[float, ...]) -> None:
     model = model_of(kv.articulations.Ball(**WHERE, cone=0.8, twist=0.5, velocity=2))

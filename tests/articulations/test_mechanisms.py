@@ -98,7 +98,6 @@ def test_mechanism_limits_are_constraints(mechanism: Mechanism) -> None:
 @pytest.mark.sampled(2)
 @each
 @pytest.mark.parametrize("direction", [1.0, -1.0])
-@pytest.mark.sampled(2)
 def test_velocity_rows_keep_all_limits_of_mechanisms(mechanism: Mechanism, direction: float) -> None:
     model = model_of(mechanism)
     wish = {str(s): direction for s in model.speeds}

@@ -69,6 +69,7 @@ def last_of_a_page(count: int) -> np.ndarray:
     return np.frombuffer(pages, count=size // 8)[size // 8 - count :]
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.compiler
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="uses mprotect")
 @pytest.mark.parametrize("inputs", [1, 2, 3, 5, 7, 8, 9])

@@ -55,6 +55,7 @@ def is_valid(model: kv.Model, result, error: kv.expressions.Expression, values=(
     return bool(np.abs(error(state)).max() <= TOLERANCE) and not model.violations(result.best)
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize(
     ("name", "frames"),
     [

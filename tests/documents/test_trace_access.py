@@ -193,7 +193,6 @@ def test_accesses_that_decide_are_recorded(code: Code, changes: tuple[str, ...])
 @pytest.mark.sampled(2)
 @of_changes
 @pytest.mark.parametrize("code", FOLLOWED.values(), ids=FOLLOWED)
-@pytest.mark.sampled(2)
 def test_common_code_is_followed_everywhere(code: Code, changes: tuple[str, ...]) -> None:
     document = to_json(build(code))
     for name in changes:

@@ -151,6 +151,7 @@ def _revision(result: Result) -> int:
     return int(result.commit.message.revision)
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("name", gallery.names())
 def test_scenes_arrive_operation_by_operation(name: str) -> None:
     scene = kv.load(f"articulations/{name}")

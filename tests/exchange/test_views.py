@@ -523,7 +523,7 @@ class Depend(kv.Operation):
         return kv.model.Writes(rates={self.coordinate: 2 * self.on})
 
 
-@settings(max_examples=attempts(60, long=400))
+@settings(max_examples=attempts(40, long=400))
 @given(st.lists(st.lists(action, min_size=1, max_size=4), min_size=1, max_size=12), st.integers(1, 3))
 def test_replicas_that_follow_random_edits_are_equal_to_parts_made_anew(
     edits: list[list[tuple[Any, ...]]], together: int

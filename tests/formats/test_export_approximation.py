@@ -116,6 +116,7 @@ CASES = {
 }
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize(
     ("ending", "build", "tolerance"),
     [pytest.param(e, b, t, id=f"{n}.{e}") for e, cases in CASES.items() for n, b, t in cases],

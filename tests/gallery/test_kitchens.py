@@ -24,6 +24,7 @@ def _upper(model, q):
     return float(model.constraints[f"{q}/position"].upper)
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("seed", SEEDS)
 def test_generate_kitchen_each_object_opens_without_contact(seed):
     model = kitchens.generate_kitchen(seed)

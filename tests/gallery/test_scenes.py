@@ -54,6 +54,7 @@ def test_scene_has_bodies_and_violates_no_constraint_at_the_default_state(name):
     assert gallery.summary(name)
 
 
+@pytest.mark.sampled(2)
 @every
 def test_scene_moves_over_the_whole_range_of_every_slider(name):
     model = opened(name)

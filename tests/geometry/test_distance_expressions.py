@@ -78,6 +78,7 @@ def between(low, value, high, tolerance):
     return ((low - tolerance <= value) & (value <= high + tolerance)).all()
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.compiler
 @pytest.mark.parametrize("fixed", ["rod", "other"])
 @pytest.mark.parametrize("geometry", [Sphere(0.03), Box((0.05, 0.06, 0.04)), Capsule(0.03, 0.08), Cylinder(0.03, 0.06),

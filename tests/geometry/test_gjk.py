@@ -43,6 +43,7 @@ def test_support_point_lies_on_the_solid_and_on_the_support_plane(kind):
         assert (ways @ point <= shape.support(ways, poses[0]) + 1e-6).all()
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize(("one", "other"), PAIRS)
 def test_widest_gap_equals_the_distance(one, other):
     """In each other there may be several summits, of which the highest may be missed."""

@@ -50,6 +50,7 @@ def body_of(shape, client):
     return bullet.createMultiBody(1.0, number, physicsClientId=client)
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize(("one", "other"), PAIRS)
 def test_distances_match_bullet_within_its_margins(one, other, shapes):
     rng = np.random.default_rng([list(FURTHER).index(kind) for kind in (one, other)])

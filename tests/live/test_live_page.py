@@ -15,7 +15,7 @@ pytest.importorskip("viser", reason="the page needs the extra 'view'")
 
 import kineverse as kv
 from kineverse.errors import InvalidValueError
-from kineverse.live.live_page import LivePage, find_robot_prefix, read_step, read_truth
+from kineverse.live.live_page import LivePage, choose_pause, find_robot_prefix, read_step, read_truth
 from kineverse.live.people import Place, move_furniture
 from kineverse.live.streams import (
     ACTIVITY,
@@ -200,6 +200,21 @@ def test_edits_are_followed_and_people_are_answered(shown):
     np.testing.assert_allclose(page.pose(CUPBOARD)[:2, 3], (2.0, 1.0), atol=1e-9)
     move_furniture(live, CUPBOARD, 3.0, 1.0, 0.0)
     drawn(system, streams, lambda: people._x.value == 3.0)
+
+
+@pytest.mark.parametrize(
+    ("rate", "spent", "is_urgent", "expected"),
+    [
+        (60.0, 0.001, False, 1 / 30),
+        (4.0, 0.001, False, 0.25),
+        (60.0, 0.2, False, 0.2),
+        (0.0, 0.0, False, 1.0),
+        (0.0, 0.0, True, 0.1),
+        (60.0, 0.001, True, 1 / 30),
+    ],
+)
+def test_the_page_gives_way_to_a_slow_browser_and_to_others(rate, spent, is_urgent, expected):
+    assert choose_pause(rate, spent, is_urgent=is_urgent) == pytest.approx(expected)
 
 
 def test_a_proposal_of_the_learner_is_accepted(shown):

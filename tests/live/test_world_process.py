@@ -273,6 +273,11 @@ def test_the_true_state_is_kept_with_what_the_hand_holds(sockets, tmp_path):
         again = Stand(live, kept=kept)
         assert dict(again.world.state) == pytest.approx(state)
         assert again.world.held == "room/drawer_handle"
+        again.process.stop()
+        again.tick()
+        again.close()
+        again = Stand(live, kept=kept)
+        assert again.process.stopped  # nobody has released it
         with pytest.raises(DuplicateNameError, match="'robot'"):
             Stand(live)
         again.close()

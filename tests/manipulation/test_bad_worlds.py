@@ -166,7 +166,7 @@ def test_session_ends_when_its_robot_stops_answering(fault, says):
     robot.blocked.set()
 
 
-@pytest.mark.sampled(4)
+@pytest.mark.sampled(7)
 @pytest.mark.parametrize(
     ("fault", "says"),
     [
@@ -250,6 +250,7 @@ def test_what_nobody_sees_at_the_end_is_not_done(upper):
     assert "no marker of it has been seen" in outcome.reason
 
 
+@pytest.mark.long  # as what is pulled
 def test_what_is_pushed_out_of_sight_and_gets_stuck_is_not_done():
     model = room().copy()
     with model.edit() as edit:
@@ -331,6 +332,7 @@ def test_open_ends_when_the_object_moves_away():
     assert robot.world.held is None
 
 
+@pytest.mark.long  # as an opening
 def test_push_ends_when_the_object_moves_away():
     world = KinematicWorld(room(), "robot")
     world.reset(opened(drawer=0.2) | {"robot/base/y": -1.0})

@@ -250,7 +250,11 @@ def test_numbers_of_a_push_are_listed_as_its_parameters_are_made() -> None:
 
 
 @pytest.mark.parametrize(
-    ("what", "value"), [("door", 0.6), pytest.param("flap", 0.7, marks=pytest.mark.long), ("drawer", 0.4)]
+    ("what", "value"),
+    [
+        ("door", 0.6),
+        *(pytest.param(*one, marks=pytest.mark.long) for one in (("flap", 0.7), ("drawer", 0.4))),
+    ],
 )
 def test_push_shuts_what_touch_alone_can_move(what: str, value: float) -> None:
     """The world reads no speed of the object; the finger stays where it touched, and nothing else is hit."""

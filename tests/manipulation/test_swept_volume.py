@@ -168,7 +168,7 @@ def test_skills_say_what_is_in_the_way_and_move_nothing() -> None:
         assert outcome.measures["free"] < scene_free.value
 
 
-@pytest.mark.parametrize("count", ["2", pytest.param("4", marks=pytest.mark.long)])
+@pytest.mark.parametrize("count", ["1", pytest.param("4", marks=pytest.mark.long)])
 def test_robots_at_random_cupboards_go_through_nothing(
     capsys: pytest.CaptureFixture[str], count: str
 ) -> None:

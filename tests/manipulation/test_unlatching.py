@@ -62,8 +62,8 @@ def test_lever_is_turned_before_the_door_and_let_back_as_soon_as_that_is_free(ro
         assert is_free(model, way.at(k)), way.at(k)
     # From the last run on nothing holds the lever, so what is reached is not latched again.
     assert all(is_free(model, way.at(k) | {LEVER: 0.0}) for k in range(way.last_run, len(way)))
-    assert way.values[way.last_run, 1] < 0.2
-    assert [way.at(k) for k in way.corners][:1] == [{LEVER: pytest.approx(0.65), DOOR: 0.0}]
+    assert way.values[way.last_run, 1] == pytest.approx(min(0.111, target), abs=2e-3)
+    assert [way.at(k) for k in way.corners][:1] == [{LEVER: pytest.approx(0.72), DOOR: 0.0}]
 
 
 def test_door_that_is_open_is_moved_alone_and_one_that_may_be_shut_is_not(room):
@@ -146,10 +146,9 @@ def move(model, robot, what, *, world, noise, target=None, start=None, at=None, 
     return outcome, values
 
 
-def test_room_door_opens_by_its_lever_on_estimates():
-    pytest.importorskip("mujoco")
+def test_room_door_opens_by_its_lever_and_is_let_go_at_rest():
     model = kv.load("articulations/door_with_handle")
-    outcome, values = move(model, "hsr", DOOR, world="mujoco", noise=True, target=0.5)
+    outcome, values = move(model, "hsr", DOOR, world="kinematic", noise=False, target=0.5)
     assert outcome, outcome.reason
     assert outcome.measures["unlatched"] == [str(LEVER)]
     assert outcome.measures["pushed"] is False
@@ -157,17 +156,13 @@ def test_room_door_opens_by_its_lever_on_estimates():
     assert values["release"][0][LEVER] < 0.05  # turned back before it is let go
 
 
-def test_microwave_opens_by_its_button_on_estimates_and_is_latched_again():
+def test_microwave_opens_by_its_button_on_estimates():
     model = microwave()
     outcome, values = move(model, "hsr", OVEN, world="kinematic", noise=True, target=0.5)
     assert outcome, outcome.reason
     assert outcome.measures["unlatched"] == [str(BUTTON)]
     assert max(state[BUTTON] for state in values["push"]) > 0.004
     assert values["move"][0][BUTTON] < 1e-6  # on its spring
-    closed, _ = move(microwave(), "hsr", OVEN, world="kinematic", noise=False, target=0.0, at={OVEN: 0.3})
-    assert closed, closed.reason
-    assert closed.value < 0.003
-    assert "unlatched" not in closed.measures
 
 
 @pytest.mark.long
@@ -191,3 +186,12 @@ def test_microwave_is_opened_by_shipped_robots(robot, world, noise):
     outcome, _ = move(microwave(), robot, OVEN, world=world, noise=noise)
     assert outcome, outcome.reason
     assert str(BUTTON) in outcome.measures["unlatched"]
+
+
+@pytest.mark.long
+def test_microwave_is_latched_before_it_is_let_go():
+    pytest.importorskip("mujoco")
+    outcome, _ = move(microwave(), "hsr", OVEN, world="mujoco", noise=False, target=0.0, at={OVEN: 0.3})
+    assert outcome, outcome.reason
+    assert outcome.value < 0.003  # its spring would open it again
+    assert "unlatched" not in outcome.measures

@@ -177,6 +177,7 @@ SINGLE: dict[str, Triples] = {
 FEW = ("alone", "norm, then single", "slow where it is")
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize(
     ("name", "share"),
     [

@@ -34,6 +34,7 @@ def ball() -> Planner:
     return Planner(model, [x, y])
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("method", ["rrt-connect", "prm"])
 @pytest.mark.parametrize("far", [1e5, 1e6])
 def test_goals_far_away_are_answered_in_time(ball: Planner, method: str, far: float) -> None:

@@ -219,6 +219,7 @@ EXTREME = [
 ]  # fmt: skip
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("geometry", EXTREME, ids=str)
 def test_covers_of_plates_needles_and_extreme_sizes_contain_them(geometry):
     solid = solid_from_geometry(geometry)

@@ -130,6 +130,25 @@ def test_what_stops_a_robot_is_pressed_with_the_stated_force(kind: str) -> None:
             assert world.state[symbol] < stopped[symbol] - 0.5 * 0.3 * speed
 
 
+def test_a_light_wrist_turns_a_lever_against_its_spring():
+    """1.5 N m at 0.5 rad, by a joint that moves as much as 50 g at 10 cm."""
+    model = kv.Model()
+    joint = {"parent": "world", "axis": (0, 0, 1), "lower": -0.2, "upper": 1.0}
+    effort, spring = (("effort", 10.0),), (("spring_stiffness", 3.0), ("spring_reference", 0.0))
+    with model.edit() as edit:
+        edit.apply(kv.Revolute(name="robot/q", child="robot/tip", velocity=1.0, dynamics=effort, **joint))
+        light = Inertia(0.05, (5e-4, 0, 0, 5e-4, 0, 5e-4))
+        shapes = solid(((0.02, 0.02, 0.02), (0.1, 0, 0))).collisions
+        edit.apply(SetBody("robot/tip", Body(collisions=shapes, inertia=light)))
+        edit.apply(kv.Revolute(name="room/lever", child="room/lever", dynamics=spring, **joint))
+        edit.apply(SetBody("room/lever", solid(((0.1, 0.02, 0.02), (0.08, 0.021, 0)), mass=0.1)))
+    world = MujocoWorld(model, "robot", floor=False)
+    for _ in range(100):
+        world.apply({"robot/q:velocity": 0.5}, 0.01)
+    assert world.state["room/lever"] == pytest.approx(0.5, abs=0.05)
+    assert world.state["robot/q"] == pytest.approx(0.5, abs=0.05)
+
+
 def test_a_door_without_limits_does_not_turn_through_its_frame():
     for model, stops in ((room(limited=False), True), (room(limited=False, sunk=0.05), True)):
         world = MujocoWorld(model, "robot", door_friction={"room/door": 0.0})

@@ -11,11 +11,11 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -42,6 +42,7 @@ ZERO, REST, HELD = 0.05, 0.15, 0.01
 a handle that is held [m]."""
 SLOW = 0.05  # speed of a joint below which a robot rests [m/s], [rad/s]
 FROZEN = 1.0  # time for which a process is frozen [s]
+SPEEDING_UP = 0.5  # time in a phase until the robot has its speed [s]
 AFTER = 0.5  # time for which the robot is watched after a fault [s]
 STARTING, FINISHING = 120.0, 240.0  # longest times until a phase, and until all is done [s]
 HOLDING = "move"  # phase in which the robot holds the object and moves it
@@ -84,9 +85,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> Iterator[str]:
     """Try the runs, and yield a line for each."""
+    setting = Setting(make_kitchen(), DRAWER, HANDLE, arguments.robot)
     for k, fault in enumerate(FAULTS[: arguments.runs]):
-        found = try_fault(fault, arguments.robot, arguments.most)
-        yield f"{k + 1} {fault}: " + ", ".join(f"{name} {value}" for name, value in found.items())
+        (found,) = try_faults(setting, [fault], arguments.most)
+        times = [
+            f"{name} after {1e3 * found[name]:.0f} ms" for name in ("zero", "rest") if found[name] >= 0.0
+        ]
+        yield ", ".join([f"{k + 1} {fault}", *times, f"the handle {1e3 * found['way']:.1f} mm", "then done"])
 
 
 class Watch(threading.Thread):
@@ -132,18 +137,33 @@ def _is_new(kept: list[tuple[float, float, np.ndarray]], stamp: float) -> bool:
     return not kept or stamp > kept[-1][0]
 
 
-def try_fault(fault: Fault, robot: str, most: float = 1.0) -> dict[str, Any]:
-    """Start a live system, send a signal to a process, and return what was measured."""
+class Setting(NamedTuple):
+    """Scene of a live system, and the object that is opened and closed."""
+
+    model: kv.Model
+    what: str
+    handle: str
+    robot: str = "hsr"
+    world: str = "mujoco"
+
+
+def try_faults(setting: Setting, faults: Sequence[Fault], most: float = 1.0) -> list[dict[str, float]]:
+    """Start a live system, send signals to its processes, and return what was measured after each."""
     with folder() as path:
-        output, kitchen = Path(path, "output"), Path(path, "kitchen.kv.json")
-        _make_kitchen().save(kitchen)
-        words = [str(kitchen), "--robot", robot, "--world", "mujoco", "--do", "tour", "--what", DRAWER]
-        words += ["--far", "1", "--headless", "--json", "--name", "fault", "--seconds", str(FINISHING)]
-        command = [sys.executable, "-m", "kineverse", "live", *words]
+        output, model = Path(path, "output"), Path(path, "model.kv.json")
+        setting.model.save(model)
+        words = [str(model), "--robot", setting.robot, "--world", setting.world, "--do", "tour", "--far", "1"]
+        words += ["--what", setting.what, "--headless", "--json", "--name", "fault"]
+        command = [sys.executable, "-m", "kineverse", "live", *words, "--seconds", str(FINISHING)]
         with output.open("w", encoding="utf-8") as out:
             system = subprocess.Popen(command, stdout=out, stderr=subprocess.STDOUT, cwd=path)
         try:
-            return _measure(fault, system, output, most)
+            watch = Watch(_connect(system, output), setting.what, setting.handle)
+            watch.start()
+            found = [_send(fault, watch, system, output, most) for fault in faults]
+            _finish(faults, system, output)
+            watch.over = True
+            return found
         finally:
             if system.poll() is None:
                 system.send_signal(signal.SIGINT)
@@ -153,7 +173,7 @@ def try_fault(fault: Fault, robot: str, most: float = 1.0) -> dict[str, Any]:
             system.wait()
 
 
-def _make_kitchen() -> kv.Model:
+def make_kitchen() -> kv.Model:
     """Return the kitchen with a drawer that is pulled slowly."""
     model = kv.Model()
     with model.edit() as edit:
@@ -162,18 +182,19 @@ def _make_kitchen() -> kv.Model:
     return model
 
 
-def _measure(fault: Fault, system: subprocess.Popen[bytes], output: Path, most: float) -> dict[str, Any]:
-    watch = Watch(_connect(system, output), DRAWER, HANDLE)
-    watch.start()
+def _send(
+    fault: Fault, watch: Watch, system: subprocess.Popen[bytes], output: Path, most: float
+) -> dict[str, float]:
+    """Send a signal in its phase, and check how the robot stops."""
     moves = fault.phase in (HOLDING, "approach", "retract")
 
     def is_there() -> bool:
-        assert system.poll() is None, f"it ended: {output.read_text('utf-8')[-2000:]}"
+        assert system.poll() is None, f"{fault}: it ended: {output.read_text('utf-8')[-2000:]}"
         return watch.phase == fault.phase and (not moves or watch.speed > 2 * SLOW)
 
     wait_until(is_there, STARTING, f"the phase '{fault.phase}'")
     if moves:
-        time.sleep(0.5)  # at its speed
+        time.sleep(SPEEDING_UP)
     pid = watch.pids()[fault.process]
     at = time.time()
     os.kill(pid, getattr(signal, f"SIG{fault.signal}"))
@@ -183,30 +204,29 @@ def _measure(fault: Fault, system: subprocess.Popen[bytes], output: Path, most: 
     else:
         time.sleep(AFTER)
     found = _find_stop(watch, at)
-    stops = fault.process in ("behave", "track") and moves
-    if stops:
+    if fault.process in ("behave", "track") and moves:
         assert found["zero"] <= most * ZERO, f"{fault}: commanded speeds are zero after {found['zero']:.3f} s"
         if fault.phase == HOLDING:
             assert found["way"] <= most * HELD, f"{fault}: the handle moved {1e3 * found['way']:.1f} mm"
         else:
             assert found["rest"] <= most * REST, f"{fault}: the robot rests after {found['rest']:.3f} s"
+    else:
+        found |= {"zero": math.nan, "rest": math.nan}
+    return found
+
+
+def _finish(faults: Sequence[Fault], system: subprocess.Popen[bytes], output: Path) -> None:
+    """Wait until all is done, and check that what was killed was started again."""
+    which = ", ".join(map(str, faults))
     try:
         system.wait(FINISHING)
     except subprocess.TimeoutExpired:
-        raise AssertionError(f"{fault}: not finished. {output.read_text('utf-8')[-2000:]}") from None
-    watch.over = True
+        raise AssertionError(f"{which}: not finished. {output.read_text('utf-8')[-2000:]}") from None
     text = output.read_text("utf-8")
-    assert system.returncode == 0, f"{fault}: not done. {text[-2000:]}"
-    answer = json.loads(text[text.index("{") :])
-    restarts = answer["restarts"]
-    assert fault.signal == "STOP" or sum(restarts.values()), f"{fault}: nothing was started again"
-    milliseconds = {name: f"{1e3 * found[name]:.0f} ms" for name in ("zero", "rest") if stops}
-    return {
-        **milliseconds,
-        "way": f"{1e3 * found['way']:.1f} mm",
-        "restarts": sum(restarts.values()),
-        "done": True,
-    }
+    assert system.returncode == 0, f"{which}: not done. {text[-2000:]}"
+    restarts = json.loads(text[text.index("{") :])["restarts"]
+    for name in {fault.process for fault in faults if fault.signal == "KILL"}:
+        assert restarts.get(name), f"{which}: '{name}' was not started again"
 
 
 def _connect(system: subprocess.Popen[bytes], output: Path) -> kv.exchange.LiveModel:

@@ -17,7 +17,6 @@ from kineverse.geometry.exclusions import remove_unusable_shapes
 from kineverse.grasping import Gripper, Handle, find_handle
 from kineverse.manipulation import JudgedOutcome, PlacedRobot, Robot, Session, judge_outcome, place_robot
 from kineverse.manipulation.articulated_objects import find_shut_value
-from kineverse.manipulation.opening.contact_phases import find_keys
 from kineverse.manipulation.outcome import Outcome
 from kineverse.manipulation.skill_run import choose_tolerance, explain_fixed
 from kineverse.model.model import Model
@@ -115,8 +114,11 @@ def make_scene(
     if not math.isfinite(end):
         raise InvalidValueError(f"'{coordinate}' has no limit at which it is open; say how far: --to VALUE.")
     fixed = explain_fixed(model, coordinate, default.updated({coordinate: begin}))
-    if skill != "push" and find_keys(model, robot, coordinate):
-        fixed = ""  # a hand may unlatch it
+    if fixed and skill != "push":
+        from kineverse.manipulation.opening.contact_phases import find_keys  # for start-up time
+
+        if find_keys(model, robot, coordinate):
+            fixed = ""  # a hand may unlatch it
     if not fixed:  # that it is fixed is the result
         _check_limits(model, "--to", coordinate, end)
     if look is not None:
@@ -342,6 +344,7 @@ class SkillTrial:
             seed=arguments.seed,
             way=OPEN_WAY if far is None else far,
             turn=OPEN_TURN if far is None else far,
+            in_thread=self._world is None,
         )
         judged = self._judge(outcome, metrics)
         there = abs(judged.value - start[coordinate])

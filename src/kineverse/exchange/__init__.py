@@ -10,6 +10,6 @@ if TYPE_CHECKING:
     from .connection import Connection as Connection
     from .relay import Relay as Relay
     from .server import Server as Server, serve as serve
-    from .state import StatePublisher as StatePublisher, StateReader as StateReader
+    from .state import Newest as Newest, StatePublisher as StatePublisher, StateReader as StateReader
 
 lazy_face(__name__)

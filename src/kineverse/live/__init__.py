@@ -5,11 +5,21 @@ from typing import TYPE_CHECKING
 from kineverse._lazy import lazy_face
 
 if TYPE_CHECKING:
-    from .behaviour_process import BehaviourProcess as BehaviourProcess
-    from .behaviours import Behaviour as Behaviour
+    from .behaviour_process import BehaviourProcess as BehaviourProcess, LiveSessions as LiveSessions
+    from .behaviours import (
+        Behaviour as Behaviour,
+        Closer as Closer,
+        CloseByName as CloseByName,
+        OpenByName as OpenByName,
+        Tour as Tour,
+    )
+    from .children import Child as Child
     from .learner_process import LearnerProcess as LearnerProcess
     from .live_page import LivePage as LivePage
     from .live_robot import LiveBelief as LiveBelief, LiveRobot as LiveRobot
+    from .model_estimator import ModelEstimator as ModelEstimator, Proposal as Proposal
+    from .stream_recorder import StreamRecorder as StreamRecorder
+    from .supervisor import Supervisor as Supervisor
     from .tracker_process import TrackerProcess as TrackerProcess
     from .unknown_behaviour import OpenUnknown as OpenUnknown, make_unknown_scene as make_unknown_scene
     from .world_process import WorldProcess as WorldProcess

@@ -114,6 +114,16 @@ def _as_array(data: bytes, shape: tuple[int, int]) -> Array | None:
     return found if np.isfinite(found).all() else None
 
 
+def choose_pause(rate: float, spent: float, *, is_urgent: bool = False) -> float:
+    """Return the time until the next drawing [s].
+
+    The browser draws at a rate [Hz], 0 if none looks, and the last drawing has taken some time [s], as long
+    as which is left to others. It is urgent while a stop is asked for.
+    """
+    pause = max(PERIOD, 1.0 / rate if rate else _UNWATCHED, spent)
+    return min(pause, _STOPPING) if is_urgent else pause
+
+
 def find_robot_prefix(newest: Newest | None) -> str:
     """Return the prefix of a robot's names, from the coordinates that it reports; empty without any."""
     names = () if newest is None else newest.names
@@ -176,10 +186,8 @@ class LivePage(Closing):
                 if str(error) != self._error:
                     logger.exception("the live system could not be shown")
                 self._error = str(error)
-            rate = self.stop.slowest_rate
-            # As much time is left to others as the drawing has taken.
-            due = max(PERIOD, 1.0 / rate if rate else _UNWATCHED, time.monotonic() - begin)
-            due = min(due, _STOPPING) if self.stop.wanted else due
+            spent = time.monotonic() - begin
+            due = choose_pause(self.stop.slowest_rate, spent, is_urgent=self.stop.wanted)
 
     def step(self) -> bool:
         """Draw what is newest; return False if there is nothing, or a browser has not taken the last one."""

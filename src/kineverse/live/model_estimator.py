@@ -63,29 +63,15 @@ _AWAY = 1.0  # time without a pose from which on a part is hidden [s]
 
 @dataclass(frozen=True, eq=False)
 class Proposal:
-    """Operation that would make the model explain what was seen.
-
-    Attributes
-    ----------
-    tag, operation, before
-        The operation, its tag, and the one that has the tag now; None if there is none.
-    what
-        What it does, in words.
-    frame
-        Frame that it places.
-    since
-        Time since which it is proposed [s].
-    fit
-        The identified joint; None if it is no joint of an unknown part.
-    """
+    """Operation that would make the model explain what was seen."""
 
     tag: str
     operation: Operation
-    before: Operation | None
-    what: str
-    frame: str
-    since: float
-    fit: Fit | None = None
+    before: Operation | None  # operation that has the tag now
+    what: str  # what it does, in words
+    frame: str  # frame that it places
+    since: float  # time since which it is proposed [s]
+    fit: Fit | None = None  # identified joint, if it is that of an unknown part
 
     def write(self, edit: Edit, model: Model) -> bool:
         """Write the operation in an edit of the model; return False if another one has its tag by now."""
@@ -134,7 +120,7 @@ class _Part:
 
     @property
     def is_of_interest(self) -> bool:
-        """Whether something can be said of the part, or it was asked for."""
+        """True if something can be said of the part, or it was asked for."""
         has_moved = self.learning.poses >= _FEWEST and self.distance > _MOVED
         return self.is_named or self.written is not None or has_moved
 
@@ -357,7 +343,7 @@ class ModelEstimator:
         What was seen of it are not its limits.
         """
         joint, tag = known.joint, known.joint.tag
-        if not isinstance(operation, (Prismatic, Revolute)):
+        if not isinstance(operation, (Prismatic, Revolute)) or not isinstance(operation.origin, Pose):
             return operation
         pose, defaults = self.model.fk(joint.child, joint.parent), self.model.default_state()
         zero = np.asarray(pose({s: defaults[s] for s in pose.symbols}))
@@ -391,7 +377,8 @@ class ModelEstimator:
         for frame in self._furniture:
             tag = self._writer(frame)
             if frame not in moved:
-                if frame in seen and self.alarms.pop(tag, None):
+                if frame in seen and tag in self.alarms:
+                    del self.alarms[tag]
                     self.proposals.pop(tag, None)
                 continue
             away, turned = moved[frame]
@@ -449,10 +436,10 @@ class ModelEstimator:
         for joint in find_testable_joints(model, names, WORLD).joints:
             if not joint.moves or joint.tag in unknown or joint.child in parts:
                 continue
-            before = self._known.get(joint.tag)
+            there = self._known.get(joint.tag)
             served = model.history.operation(joint.tag)
-            if before is not None and before.joint == joint and before.served == served:
-                known[joint.tag] = before
+            if there is not None and there.joint == joint and there.served == served:
+                known[joint.tag] = there
                 continue
             relative_to = WORLD if joint.parent == WORLD else None
             frames = [f for f in (joint.parent, joint.child) if f != WORLD]

@@ -197,7 +197,7 @@ def read_note(reader: StateReader, source: str, kind: type[Note]) -> Note | None
 def ask(reader: StateReader, source: str, do: str, timeout: float = 5.0, **arguments: Any) -> Any:
     """Ask a process to do something, and return its answer.
 
-    One that does not answer is an OfflineError, and one that cannot do it a KineverseError with its reason.
+    It is an OfflineError if none comes, and a KineverseError with the reason if it cannot do that.
     """
     answer = decode(reader.ask(source, encode(Ask(do, arguments)), timeout), Answer)
     if answer is None:

@@ -18,7 +18,7 @@ from kineverse.manipulation import ArticulatedObject, Outcome, Session, open_unk
 from kineverse.manipulation.articulated_objects import find_shut_value
 from kineverse.manipulation.unknown_objects import forget_joint
 from kineverse.manipulation.unknown_objects.unmodelled_joint import free_part
-from kineverse.model.model import Model
+from kineverse.model.model import Model, Snapshot
 from kineverse.model.model_view import ModelView
 from kineverse.state import State
 from kineverse.symbols import Symbol, position
@@ -71,6 +71,7 @@ class OpenUnknown(Behaviour):
 
     name = "unknown"
     overlap = 0.01  # a joint that was learned is off by millimetres
+    in_thread = True  # joints are fitted while the robot moves on
     heeds_edits = False  # the learner edits the model in the middle of a pull
 
     def __init__(
@@ -136,7 +137,9 @@ class OpenUnknown(Behaviour):
 
     def _open(self, session: Session, part: str) -> None:
         """Open a part by pulling at its handle, and learning how it moves."""
-        model = session.model if isinstance(session.model, Model) else session.model.model()
+        given = session.model
+        model = given.model() if isinstance(given, Snapshot) else given
+        assert isinstance(model, Model)
         try:
             handle = find_bar(model, part, session.state)
         except KineverseError as error:
@@ -145,7 +148,7 @@ class OpenUnknown(Behaviour):
         self._say(f"opens '{part}'", "Nobody has described how it moves; the hand pulls and follows.")
         outcome = open_unknown(
             session, handle, model=model, part=part, hand=self.scene.gripper, seconds=self._seconds,
-            seed=self.seed + self._tries.get(part, 0),
+            seed=self.seed + self._tries.get(part, 0), in_thread=self.in_thread,
         )  # fmt: skip
         self._tries[part] = tries = self._tries.get(part, 0) + 1
         self._is_hand_checked = bool(outcome)
@@ -173,13 +176,7 @@ def find_coordinate(model: ModelView, part: str) -> Symbol | None:
 
 
 def find_bar(model: Model, part: str, state: State) -> str:
-    """Return the body of a part, or on it, that a hand closes around.
-
-    Raises
-    ------
-    UnknownNameError
-        If there is none.
-    """
+    """Return the body of a part, or on it, that a hand closes around; UnknownNameError if there is none."""
     on_it = [f for f in model.bodies if part in path_to_root(model, f) and not model.fk(f, part).symbols]
     for frame in sorted(on_it, key=lambda f: -len(path_to_root(model, f))):
         try:

@@ -57,6 +57,7 @@ class _KeptState(msgspec.Struct):
 
     values: dict[str, float]  # by coordinate
     held: str | None = None  # body in the hand
+    stopped: str = ""  # why the robot takes no commands
 
 
 class WorldProcess:
@@ -104,9 +105,9 @@ class WorldProcess:
         self._follower: Follower[ChangeableWorld] | None = follow(live, make) if follows else None
         self.world = make(live.snapshot()) if self._follower is None else self._follower.value
         self._version = None if self._follower is None else self._follower.version
-        self.stopped = ""
+        self.stopped = self._kept_stop = ""
         self._ticks = self._late = self._dropped = self._refused = self._picture = 0
-        self._command: tuple[float, int] = (-math.inf, -1)  # the last one that was counted as too old
+        self._command: tuple[float, int] = (-math.inf, -1)  # the last one that came, by stamp and number
         self._fingers: dict[str, float] = {}
         self._commanded = 0.0
         self._asked: queue.SimpleQueue[tuple[Callable[[], None], Future[None]]] = queue.SimpleQueue()
@@ -211,7 +212,7 @@ class WorldProcess:
             self.stop(f"protective stop, {self._limit.peak:.0f} N of at most {self._limit.limit:g} N")
         self._ticks += 1
         self._publish(now)
-        if self._kept is not None and self._ticks % _KEPT_TICKS == 0:
+        if self._kept is not None and (self._ticks % _KEPT_TICKS == 0 or self.stopped != self._kept_stop):
             self._keep()
 
     def _choose_speeds(self, now: float) -> dict[str, float]:
@@ -223,10 +224,9 @@ class WorldProcess:
         arrived = now - (time.monotonic() - newest.arrival)
         if note.stamped:
             until = newest.stamp + self._timeout
-            number = newest.stamp, note.number
-            if now - newest.stamp > OLDEST and number != self._command and arrived > now - TICK:
-                self._command = number
-                self._refused += 1
+            if (command := (newest.stamp, note.number)) != self._command:
+                self._command = command
+                self._refused += now - newest.stamp > OLDEST
         else:
             until = arrived + max(note.duration, TICK)
         if not now < until + 1e-9 or newest.stamp > now + TICK:
@@ -277,7 +277,8 @@ class WorldProcess:
         assert self._kept is not None
         values = {str(s): float(v) for s, v in self.world.state.items() if math.isfinite(v)}
         part = self._kept.with_suffix(".part")
-        part.write_bytes(msgspec.msgpack.encode(_KeptState(values, self.world.held)))
+        self._kept_stop = self.stopped
+        part.write_bytes(msgspec.msgpack.encode(_KeptState(values, self.world.held, self._kept_stop)))
         part.replace(self._kept)
 
     def _restore(self, start: State) -> None:
@@ -289,6 +290,7 @@ class WorldProcess:
             kept = msgspec.msgpack.decode(self._kept.read_bytes(), type=_KeptState)
         except (msgspec.MsgspecError, OSError) as error:
             raise KineverseError(f"{self._kept} holds no state: {error}.") from None
+        self.stopped = self._kept_stop = kept.stopped
         known = {str(s): s for s in self.world.model.symbols}
         values = {known[name]: value for name, value in kept.values.items() if name in known}
         state = State({**start, **values}, stamp=0.0)

@@ -39,6 +39,7 @@ from .mujoco_state import MujocoContacts, MujocoCoordinates
 BANDWIDTH = 80.0  # bandwidth w [1/s]: a robot stands still some 50 ms after its speeds are zero
 _LEAD = 0.05  # largest distance of a set point from its joint [m], [rad]; less for a servo of much inertia
 _ARMATURE = 0.1  # part of the largest inertia that is added to a joint as that of its motor
+_GEARED = 0.02  # least armature of a hinge [kg m²], as of a geared motor: else a light wrist is weak
 _ACCELERATION, _TRACTION = 20.0, 6.0
 """Acceleration that a servo without a stated effort can give to the largest inertia [m/s²], [rad/s²], and
 that of a base that slides along the floor: its wheels have some friction of 0.6."""
@@ -121,7 +122,8 @@ class JointServos:
         sliding = [spec.joint(s.path).type == engine.mjtJoint.mjJNT_SLIDE for s in driven]
         self._base = np.array([s in base and k for s, k in zip(driven, sliding, strict=True)], dtype=bool)
         for symbol, i in zip(driven, inertia.tolist(), strict=True):
-            joint, armature = spec.joint(symbol.path), 0.0 if symbol in base else _ARMATURE * i
+            joint, slides = spec.joint(symbol.path), sliding[len(forces)]
+            armature = 0.0 if symbol in base else max(_ARMATURE * i, 0.0 if slides else _GEARED)
             joint.armature += armature
             joint.actfrclimited = False  # the servo has the limit
             i += armature
@@ -149,7 +151,7 @@ class JointServos:
         remark(
             f"servos of bandwidth {bandwidth:g}/s drive {len(driven)} coordinates, with the largest "
             f"inertia of {_CONFIGURATIONS} configurations ({smallest:.2g} to {largest:.3g} kg m² or kg) and "
-            f"the effort of the model; joints have {_ARMATURE:g} of it as armature"
+            f"the effort of the model; armature is {_ARMATURE:g} of it, at hinges at least {_GEARED:g} kg m²"
         )
         remark(f"what stops a servo is pressed with {press:g} N at most, as far as its effort goes")
         if raised:

@@ -115,7 +115,7 @@ def run(progress: Progress, options: Options) -> Report:
     run_one = run_topics if options.ros else run_processes
     runs = [run_one(job) for job in progress(jobs, "live", "object")]  # one at a time: they are in real time
     lock_step = [] if options.quick or options.ros else list(_run_lock_step(progress, options, noise, robots))
-    return _make_report(runs, lock_step, options)
+    return make_live_report(runs, lock_step, options)
 
 
 # -- in real time --------------------------------------------------------------------------------------------
@@ -278,13 +278,14 @@ def _run_lock_step(
 # -- what is reported ----------------------------------------------------------------------------------------
 
 
-def _make_report(
+def make_live_report(
     runs: list[RealTimeRun], lock_step: list[tuple[str, list[Trial]]], options: Options
 ) -> Report:
     columns = {
         "robot": lambda one: one.robot,
         "object": lambda one: one.thing,
-        "done": lambda one: f"{one.done} of {one.wanted}",
+        "skills": lambda one: str(one.wanted),
+        "done": lambda one: str(one.done),
         "time of one [s]": lambda one: f"{np.mean(one.seconds):.1f}" if one.seconds else "-",
         "error of the estimate [mm], [mrad]": lambda one: f"{1e3 * one.error:.1f}",
         "force [N]": lambda one: f"{one.force:.0f}",

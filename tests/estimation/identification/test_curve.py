@@ -55,6 +55,7 @@ def poses_along(path: str, seed: int, rows: int, count: int = 36) -> Array:
     return poses if rows == 6 else poses[:, :3, 3]
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("rows", [6, 3], ids=["poses", "positions"])
 @pytest.mark.parametrize("path", PATHS)
 def test_a_curve_is_never_identified_as_a_joint(path: str, rows: int) -> None:

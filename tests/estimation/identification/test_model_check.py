@@ -58,6 +58,7 @@ def test_right_noise_is_no_misfit() -> None:
     assert np.median(misfits) == pytest.approx(1.0, abs=0.1)
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("family", ["planar", "spherical", "cylindrical", "free"])
 def test_joints_with_several_values_are_sure_if_these_lie_on_no_curve(family: str) -> None:
     data = recording(family, count=16, position=0.004, orientation=0.015, seed=0)

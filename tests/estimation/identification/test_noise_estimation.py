@@ -168,7 +168,6 @@ LONG = ("outliers of both", "outliers among positions")
     "case", [pytest.param(case, marks=pytest.mark.long if case in LONG else ()) for case in NOTHING]
 )
 @pytest.mark.parametrize("noise", [None, NOISE], ids=["unknown", "stated"])
-@pytest.mark.sampled(2)
 def test_observations_without_information_have_no_sure_answer(case: str, noise) -> None:
     parent, child = NOTHING[case]
     for outliers in (None, True):

@@ -35,6 +35,7 @@ def identify_data(data: Recording, factor: float, families: object = None) -> Id
     return identify(larger(data.parent, factor), larger(data.child, factor), noise=noise, families=families)
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("family", [*JOINTS])
 def test_identify_is_invariant_to_millimetres(family: str) -> None:
     data = recording(family, count=20, position=0.002, orientation=0.01, seed=3)

@@ -137,6 +137,7 @@ def test_outliers_among_positions_are_found(family: str) -> None:
         assert len(set(identified.best.outliers) ^ set(wrong)) <= 1
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("family", TOLD)
 def test_outliers_are_found_with_unknown_noise(family: str) -> None:
     data = record_joint(family, 2)

@@ -324,6 +324,7 @@ def test_compiled_and_numpy_updates_agree_on_inliers():
         assert a.log_evidence == pytest.approx(b.log_evidence, rel=1e-6)
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.compiler
 @pytest.mark.parametrize(("gross", "steps"), [(0.1, 4), (1.0, 8)])
 def test_compiled_and_numpy_updates_agree_on_outliers(gross, steps, monkeypatch):

@@ -60,6 +60,7 @@ def test_start_beyond_half_a_turn_stays_on_its_turn():
     assert tracker.update(observer({"q": -8.9})).state["q"] == pytest.approx(-8.9, abs=0.1)
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("start", [0.0, 0.4])
 @pytest.mark.parametrize("truth", [1.0, -2.5, 20.0])
 @pytest.mark.parametrize("outliers", [None, True])

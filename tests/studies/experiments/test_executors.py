@@ -59,6 +59,7 @@ def test_results_are_independent_of_the_number_of_processes() -> None:
     check_cells(Options(processes=2))
 
 
+@pytest.mark.long
 def test_trials_run_on_two_workers_of_dask(dask_executor: Executor) -> None:
     check_cells(Options(executor=dask_executor))
     check_error(Options(executor=dask_executor))

@@ -54,6 +54,7 @@ def test_trackers_follow_the_door_and_are_never_silently_lost(tracked):
     assert velocity.moving < 0.9 * summaries["position"].moving
 
 
+@pytest.mark.long  # the table of the docs is made of this report as well
 def test_report_has_a_row_for_each_filter(tracked, tmp_path):
     report = make_report(tracked, [])
     assert [row[0] for row in report.tables[0].rows] == ["position", "velocity", "textbook"]

@@ -12,6 +12,7 @@ import math
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise, takewhile
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -21,33 +22,27 @@ from kineverse.lie import Array
 from kineverse.manipulation.outcome import SkillError
 from kineverse.model.model_view import ModelView
 from kineverse.model.symbolic_view import cached_for_version
-from kineverse.reasoning import Interlocks, UnlockingPlan, UnlockingStep, interlocks, plan_unlocking
 from kineverse.state import State
 from kineverse.symbols import Symbol
 from kineverse.worlds import Robot
 
+if TYPE_CHECKING:
+    from kineverse.reasoning import UnlockingPlan, UnlockingStep
+
 _STEP = 0.05  # distance of neighbouring values along a way [m], [rad]
-_CLEAR = (
-    0.1  # way beyond the place from which on a key is not needed any more, where it is let back [m], [rad]
-)
+_CLEAR = 0.1  # way beyond the place from which on a key is not needed after which it is let back [m], [rad]
+_BEYOND = 0.12  # largest distance by which a held key goes beyond its threshold [m], [rad]
+_HALVINGS = 5  # steps in which that place is found between two rows of a way
 _SIGMAS = 3.0  # standard deviations from where it rests up to which a part may rest
 _SHARE = 0.4  # largest distance from a target, as a share of its distance beyond a threshold
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Way:
-    """Way of a handle: values of all coordinates that move it, one row after another.
+    """Way of a handle: values of all coordinates that move it, one row after another."""
 
-    Attributes
-    ----------
-    coordinates
-        Coordinates (m,): that of the object comes last.
-    values
-        Their values (K, m) [m], [rad].
-    """
-
-    coordinates: tuple[Symbol, ...]
-    values: Array
+    coordinates: tuple[Symbol, ...]  # coordinates (m,), that of the object last
+    values: Array  # their values (K, m) [m], [rad]
 
     @classmethod
     def straight(
@@ -106,25 +101,15 @@ class Way:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ContactPhase:
-    """Moves that one contact makes.
+    """Moves that one contact makes."""
 
-    Attributes
-    ----------
-    coordinate, target
-        The coordinate that moves last, and its value at the end [m], [rad].
-    tolerance
-        Largest distance from there that passes the threshold of a lock [m], [rad]; None without one.
-    handle
-        What is held; None if the part is pressed.
-    way
-        The way of what is held or pressed.
-    """
-
-    coordinate: Symbol
-    target: float
-    tolerance: float | None
-    handle: Handle | None
-    way: Way
+    coordinate: Symbol  # coordinate that moves last
+    target: float  # its value at the end [m], [rad]
+    tolerance: (
+        float | None
+    )  # largest distance from there that passes the threshold of a lock; None without one
+    handle: Handle | None  # what is held; None if the part is pressed
+    way: Way  # way of what is held or pressed
 
 
 def find_keys(model: ModelView, robot: Robot, coordinate: Symbol) -> tuple[Symbol, ...]:
@@ -138,19 +123,8 @@ def find_keys(model: ModelView, robot: Robot, coordinate: Symbol) -> tuple[Symbo
 class PhasePlanner:
     """Planner of the next contact phase for an object that is held by a handle.
 
-    Parameters
-    ----------
-    model, robot
-        Model of the robot and its furniture, and the robot in it.
-    handle
-        Handle of the object.
-
-    Attributes
-    ----------
-    coordinate, carriers
-        Coordinate of the object, and others that move its handle, such as that of a lever on a door.
-    has_keys
-        Whether where other parts are decides if the object can move.
+    ``carriers`` are coordinates that move the handle besides that of the object, such as that of a lever on a
+    door. With ``has_keys``, where other parts are decides if the object can move.
     """
 
     def __init__(self, model: ModelView, robot: Robot, handle: Handle) -> None:
@@ -228,11 +202,27 @@ class PhasePlanner:
         corners = [[*at.values()]]
         for step in group:
             before = at[step.coordinate]
-            at[step.coordinate] = step.target
+            at[step.coordinate] = (
+                step.target if step is group[-1] else self._go_beyond(step, surely, at, target)
+            )
             if step is group[-1]:
                 corners += self._let_back(surely, at, before, target)
             corners.append([*at.values()])
         return ContactPhase(last, end, None, self._handle, Way.through(order, corners))
+
+    def _go_beyond(
+        self, step: UnlockingStep, state: State, at: Mapping[Symbol, float], target: float
+    ) -> float:
+        """Return a value clear of the threshold of a key: a hand gives way to its spring."""
+        key, threshold = step.coordinate, step.threshold
+        if threshold is None or step.target == threshold:
+            return step.target
+        side = math.copysign(1.0, step.target - threshold)
+        room = side * (self._model.limits(key)[side > 0.0] - threshold)
+        far = threshold + side * min(_BEYOND, room / 2)
+        plan = self._plan(state.updated({**at, key: far}), target, ())
+        free = plan.verdict == "found" and all(later.coordinate != key for later in plan.steps)
+        return far if free and side * (far - step.target) > 0.0 else step.target
 
     def _let_back(
         self, state: State, end: dict[Symbol, float], before: float, target: float
@@ -244,22 +234,30 @@ class PhasePlanner:
         """
         *keys, last = end
         resting = {s: float(state[s]) for s in keys}
-        run = Way.straight(last, before, end[last]).values[:, 0]
-        for value in run[1:].tolist():
-            there = state.updated({**resting, last: value})
-            plan = self._plan(there, target, ())
-            if plan.verdict != "found" or any(step.coordinate in keys for step in plan.steps):
-                continue
-            beyond = math.copysign(_CLEAR, end[last] - before)
-            value = value + beyond if abs(end[last] - value) > _CLEAR else end[last]
-            pulled = [*(end[s] for s in keys), value]
-            end |= resting
-            return [pulled, [*resting.values(), value]]
-        return []
+
+        def is_free(value: float) -> bool:
+            plan = self._plan(state.updated({**resting, last: value}), target, ())
+            return plan.verdict == "found" and not any(step.coordinate in keys for step in plan.steps)
+
+        run = Way.straight(last, before, end[last]).values[:, 0].tolist()
+        k = next((k for k in range(1, len(run)) if is_free(run[k])), None)
+        if k is None:
+            return []
+        latched, free = run[k - 1], run[k]
+        for _ in range(_HALVINGS):
+            middle = (latched + free) / 2
+            latched, free = (latched, middle) if is_free(middle) else (middle, free)
+        rest = end[last] - free
+        free = free + math.copysign(_CLEAR, rest) if abs(rest) > _CLEAR else end[last]
+        pulled = [*(end[s] for s in keys), free]
+        end |= resting
+        return [pulled, [*resting.values(), free]]
 
     def _plan(self, state: State, target: float, still: Collection[Symbol]) -> UnlockingPlan:
+        from kineverse.reasoning import interlocks, plan_unlocking  # for start-up time
+
         model = self._model
-        found: Interlocks = cached_for_version(model, ("interlocks",), lambda: interlocks(model))
+        found = cached_for_version(model, ("interlocks",), lambda: interlocks(model))
         goal, places = {self.coordinate: target}, {s: state[s] for s in self._objects}
         return plan_unlocking(model, goal, places, found=found, fixed=still)
 

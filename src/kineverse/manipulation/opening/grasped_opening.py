@@ -138,6 +138,7 @@ class OpeningRun(SkillRun):
         self.opener, self.handle, self.gripper = opener, handle, opener.gripper
         self.phases = PhasePlanner(self.model, self.robot, handle)
         self.motion = HandMotion(self, opener, handle, seed, self.phases.carriers)
+        self._stalled = False  # whether a latch has not given way to the hand that holds its key
         self._stuck: dict[Symbol, str] = {}  # what did not move when it should have, and why
         self._wanted = target, tolerance
         self.target = self.tolerance = self.near = math.nan
@@ -282,9 +283,12 @@ class OpeningRun(SkillRun):
             if not late or self.rest > self.tolerance:
                 raise
         if stall is not None and self.rest > (1.0 - _LEAST_PROGRESS) * before:
-            phase, way = self._find_phase(), placement.way
-            if phase.handle is self.handle and phase.way.keys == way.keys:
-                raise stall  # else it was believed to be unlatched, and is not
+            phase, keys = self._find_phase(), placement.way.keys
+            # What was believed to be unlatched, or was latched again, is tried once more.
+            again = phase.handle is not self.handle or phase.way.keys != keys or (keys and not self._stalled)
+            self._stalled |= bool(keys)
+            if not again:
+                raise stall
         self._check_progress()
 
     def _check_progress(self) -> None:

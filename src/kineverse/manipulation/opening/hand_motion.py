@@ -278,9 +278,10 @@ class HandMotion:
     def release(self, placement: BasePlacement) -> None:
         """Open the fingers, and take the hand away."""
         self.session.phase = "release"
-        state, grasp = self.session.state, placement.grasp
+        grasp = placement.grasp
         assert grasp is not None
         self.move_fingers(self.gripper.opened)
+        state = self.session.state  # a spring may have moved the object
         world_T_bar, world_T_hand = self.bar(state), self.hand(state)
         pose = inverse(world_T_bar) @ world_T_hand
         self.session.phase = "retract"
@@ -439,6 +440,10 @@ _STALLED, _PATIENCE, _RESTING = 1e-3, 4.0, 0.5  # least progress [m], [rad] in a
 _LOCKED, _STANDING = 1.5, 1e-3
 """Time [s] after which an object that has not moved yet is not waited for, if the controller plans no speed
 beyond some [m/s], [rad/s] for it either: its own constraints hold it."""
+_LEAN, _MOST_LEAN = 3.0, 0.2
+"""Rate at which the goal of a key that stays behind goes on [1/s], and how far it goes [m], [rad]: a spring
+holds it back by as much as servos give way."""
+_GIVING = 0.5  # share of the distance of joints from their path that counts while a spring is held
 _AT_CORNER = 0.03  # distance from a corner of a way at which that counts as passed [m], [rad]
 _STEPS_AT_TARGET = 10  # number of steps for which an estimate is at the target when a motion ends
 
@@ -475,7 +480,9 @@ def move_held(motion: HandMotion, placement: BasePlacement, tolerance: float, ne
     share, pace = 0.0, Pace(session, _LATE)
     length = float(np.abs(np.diff(way.values, axis=0)).max(axis=1).sum())
     best, since = 0.0, session.time
-    corners = deque(k / (len(way) - 1) for k in way.corners)
+    last = len(way) - 1
+    corners = deque(k / last for k in way.corners)
+    ends, lean = way.values[-1], np.zeros(len(coordinates))
     controller.set(grasped, held)
     controller.set(arm_speeds, np.zeros(len(moving)))  # the path waits for the arm
     motion.refer([bar(session.state.updated(way.at(k))) @ held for k in range(len(way))])
@@ -491,15 +498,21 @@ def move_held(motion: HandMotion, placement: BasePlacement, tolerance: float, ne
             reference = row_at(rows, share)
             place = row_at(way.values, share)
             controller.set(posture, reference)
-            controller.set(wanted, place)
+            controller.set(wanted, place + lean)
             command = controller.step(state)
             # The reference waits for the slowest joint.
-            arm = np.abs(reference - state.vector(moving)).max(initial=0.0)
-            here = state.vector(coordinates)
+            arm, here = state.vector(moving), state.vector(coordinates)
             off = np.abs(place - here)
-            # What a spring takes back is not waited for where it is let back anyway.
-            after = np.abs(row_at(way.values, min(1.0, share + 1.0 / (len(way) - 1))) - here)
-            late = max(float(arm), float(np.minimum(off, after).max()))
+            late = max(float(np.abs(reference - arm).max(initial=0.0)), float(off.max()))
+            if share * last < way.last_run:
+                # What a spring has taken back is not waited for where it is let back anyway.
+                ahead = slice(int(share * last), round((corners[0] if corners else 1.0) * last) + 1)
+                joints = _GIVING * np.abs(rows[ahead] - arm).max(axis=1, initial=0.0)
+                late = min(
+                    late, float(np.maximum(joints, np.abs(way.values[ahead] - here).max(axis=1)).min())
+                )
+            lean = np.clip(lean + _LEAN * session.dt * (place - here), -_MOST_LEAN, _MOST_LEAN)
+            lean[place == ends] = lean[-1] = 0.0
         motion.refer_to(share)
         motion.run.act(command.speeds, command)
         passed = share * length

@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from kineverse._checks import as_count, as_positive
+from kineverse._checks import as_count, as_positive, check_flag
 from kineverse.control import Command
 from kineverse.errors import InvalidValueError, KineverseError, UnknownNameError, suggest
 from kineverse.estimation import Fit
@@ -76,6 +76,7 @@ def open_unknown(
     seconds: float = 60.0,
     placements: int = 1000,
     seed: int = 0,
+    in_thread: bool = False,
 ) -> Outcome:
     """Open a part whose joint is unknown or wrong, and write the learned joint into a model.
 
@@ -114,6 +115,9 @@ def open_unknown(
         Largest number of sampled bases.
     seed
         Seed of all searches.
+    in_thread
+        Whether joints are fitted in a thread of their own, and a new controller is made for much better ones
+        alone: for a robot whose time runs on meanwhile.
 
     Returns
     -------
@@ -130,6 +134,7 @@ def open_unknown(
         For frames that do not exist, a robot without a gripper, a handle that is none, or a wanted opening
         that is not positive.
     """
+    check_flag("in_thread", in_thread)
     for name, value in (("way", way), ("turn", turn), ("seconds", seconds)):
         as_positive(value, f"{name}=")
     for name in (handle, *(n for n in (part, beside) if n is not None)):
@@ -166,6 +171,7 @@ def open_unknown(
     run = UnknownOpeningRun(
         session, model, gripper, belief, (way, turn), seconds,
         as_count("placements", placements, 1), as_count("seed", seed, 0),
+        in_thread,
     )  # fmt: skip
     return run.finish_learning(run.perform(run.open))
 
@@ -189,15 +195,15 @@ class UnknownOpeningRun(SkillRun):
         seconds: float,
         samples: int,
         seed: int,
+        in_thread: bool = False,
     ) -> None:
         super().__init__(session, None, seconds)
         self.model, self.gripper, self.belief, self.unknown = model, gripper, belief, belief.unknown
         self.point, self.frame_T_handle = belief.unknown.point, belief.unknown.frame_T_handle
         self.wanted, self.samples, self.seed = wanted, samples, seed
         self.learning = JointLearning()
-        # Time runs on in a world that is not simulated in lock step.
-        self._is_late = not hasattr(session.interface, "reset")
-        self._update = self.learning.update_beside if self._is_late else self.learning.update
+        self._in_thread = in_thread
+        self._update = self.learning.update_beside if in_thread else self.learning.update
         self.opener: Opener
         self.motion: HandMotion
         self.start: Array | None = None  # pose (4, 4) of the part when it was grasped first
@@ -490,7 +496,7 @@ class UnknownOpeningRun(SkillRun):
 
     def _is_worth(self, fit: Fit, held: Fit | None) -> bool:
         """Return whether a joint is worth a new controller: where time runs on, only if it is much better."""
-        return not self._is_late or held is None or axis_deviation(fit) < _BETTER * axis_deviation(held)
+        return not self._in_thread or held is None or axis_deviation(fit) < _BETTER * axis_deviation(held)
 
     def _explain_stall(
         self, pull: StraightPull | LearnedPull, command: Command, part_T_hand: Array
