@@ -56,7 +56,7 @@ people open, until Ctrl-C. Around a model server run a simulated world in real t
 learner, a behaviour and a page, each a process; what dies is started again. The terminal shows the processes,
 what is done and why. Keys: e emergency stop, r release, k and a number kill that process, q quit.
 
-With --headless there is no page: one object of each kind is opened, by 40 % of its way unless --far says
+With --headless there is no page: one object of each kind is opened, by 30 % of its way unless --far says
 otherwise, and closed, within 90 s, with numbers and a picture. The exit status is 0 if all of it was done,
 else 1. This needs the extras 'exchange', 'control', 'geometry', a C compiler, for the page 'view', and for
 --world mujoco 'mjcf'.
@@ -71,7 +71,7 @@ examples:
 KITCHEN, ROBOT = "kitchen", "hsr"
 _BRIEF = ("*/sink_left_upper_drawer", "*/fridge_door", "*/oven_door")
 """Objects without a page, a drawer, a door and a flap, of the kitchen that ships."""
-_BRIEFLY = 0.4  # share of their ways by which they are opened
+_BRIEFLY = 0.3  # share of their ways by which they are opened
 _KINDS = ("drawer", "door", "flap")  # kinds of which one each is taken in another kitchen
 _DEADLINE = 80.0  # time from the start after which a run without a page ends [s]
 _INTERRUPTED = 130  # exit status after Ctrl-C, as of all commands
