@@ -5,20 +5,8 @@ from typing import TYPE_CHECKING
 from kineverse._lazy import lazy_face
 
 if TYPE_CHECKING:
-<<<<<<< HEAD
     from .behaviour_process import BehaviourProcess as BehaviourProcess
     from .behaviours import Behaviour as Behaviour
-=======
-    from .behaviour_process import BehaviourProcess as BehaviourProcess, LiveSessions as LiveSessions
-    from .behaviours import (
-        Behaviour as Behaviour,
-        Closer as Closer,
-        CloseByName as CloseByName,
-        OpenByName as OpenByName,
-        Tour as Tour,
-    )
-    from .children import Child as Child
->>>>>>> w-live
     from .learner_process import LearnerProcess as LearnerProcess
     from .live_page import LivePage as LivePage
     from .live_robot import LiveBelief as LiveBelief, LiveRobot as LiveRobot
