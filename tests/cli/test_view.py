@@ -65,7 +65,7 @@ def test_with_a_host_the_address_has_a_token(run, shown, tmp_path, monkeypatch):
     monkeypatch.setattr(
         AccessControl, "from_host", staticmethod(lambda host: AccessControl("127.0.0.1", f"for-{host}"))
     )
-    monkeypatch.setattr("kineverse.view.server._free_port", lambda host, port: port)
+    monkeypatch.setattr("kineverse.view.server.find_free_port", lambda host, port: port)
     (tmp_path / "robot.urdf").write_text(URDF)
     status, out, _ = run(
         "view", tmp_path / "robot.urdf", "--port", "0", "--no-browser", "--host", "localhost"

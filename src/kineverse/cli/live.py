@@ -17,7 +17,7 @@ from kineverse.exchange.address import SCHEME
 
 from .arguments import print_notes, require
 from .output import join_lines, print_line, show_activity
-from .pages import handle_interrupts
+from .pages import check_file_path, check_recording_path, handle_interrupts
 from .plan_arguments import find_robot_name, parse_robot
 
 if TYPE_CHECKING:
@@ -86,10 +86,14 @@ def add_force_option(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def check_force(limit: float | None) -> None:
-    """Check ``--force-limit``."""
-    if limit is not None and not 0.0 < limit < math.inf:
+def check_force(limit: float | None, world: str) -> None:
+    """Check ``--force-limit`` in a world."""
+    if limit is None:
+        return
+    if not 0.0 < limit < math.inf:
         raise InvalidValueError(f"--force-limit is a positive number of newtons, not {limit:g}.")
+    if world == "kinematic":
+        raise InvalidValueError("--force-limit: the kinematic world has no forces; --world mujoco has.")
 
 
 def add_rounds_option(parser: argparse.ArgumentParser) -> None:
@@ -195,13 +199,12 @@ def _run_world(arguments: argparse.Namespace) -> int:
     }
     require("kineverse world", extras)
     timeout, sensors = parse_time(arguments.timeout, "--timeout"), parse_sensors(arguments.noise)
-    check_force(arguments.force_limit)
+    check_force(arguments.force_limit, arguments.world)
     if arguments.seed < 0:
         raise InvalidValueError(f"--seed is a number from 0 on, not {arguments.seed}.")
-    if arguments.record is not None:
-        from kineverse.worlds.recorder import check_recording_name  # for start-up time
-
-        check_recording_name(arguments.record)
+    check_recording_path(arguments.record)
+    if arguments.kept is not None:
+        check_file_path(arguments.kept)
     from kineverse.live import WorldProcess  # for start-up time
 
     with handle_interrupts(), live_model(arguments) as live, ExitStack() as stack:

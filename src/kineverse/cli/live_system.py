@@ -9,7 +9,6 @@ import os
 import re
 import select
 import shutil
-import socket
 import sys
 import tempfile
 import time
@@ -22,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from kineverse.errors import InvalidValueError, KineverseError
-from kineverse.exchange.address import SCHEME, list_servers
+from kineverse.exchange.address import SCHEME, check_server_name, list_servers
 
 from .arguments import require
 from .live import (
@@ -40,7 +39,7 @@ from .live import (
     results_as_data,
 )
 from .output import format_table, join_lines, shorten_text, show_activity
-from .pages import add_page_options, check_picture_path, handle_interrupts
+from .pages import add_page_options, check_picture_path, check_recording_path, handle_interrupts
 from .plan_arguments import parse_robot
 
 if TYPE_CHECKING:
@@ -78,7 +77,6 @@ _INTERRUPTED = 130  # exit status after Ctrl-C, as of all commands
 _UNKNOWN = "unknown"  # behaviour that opens what nobody has described
 _SERVED, _TRUTH = "served.kv.json", "truth.kv.json"  # models of its run
 _RUN = "kineverse-live-"  # folders of runs, by the number of the supervisor's process
-_FIRST_PORT, _PORTS = 8080, 100
 _REDRAWN = 0.5  # time between two tables [s]
 _ADDRESS = re.compile(r"https?://\S+")
 
@@ -136,8 +134,11 @@ def run(arguments: argparse.Namespace) -> int:
     }
     require("kineverse live", extras, compiler=True)
     check_picture_path(arguments.picture)
+    check_recording_path(arguments.record)
+    if arguments.name is not None:
+        check_server_name(arguments.name)
     parse_sensors(arguments.noise)
-    check_force(arguments.force_limit)
+    check_force(arguments.force_limit, arguments.world)
     check_task(arguments.do, arguments.far, arguments.rounds)
     if arguments.seed < 0:
         raise InvalidValueError(f"--seed is a number from 0 on, not {arguments.seed}.")
@@ -228,9 +229,14 @@ class LiveSystem:
         if not arguments.headless:
             host = ["--host", arguments.host] if arguments.host else []
             quiet = ["--no-browser"] if arguments.no_browser else []
-            commands[VIEW] = ["view", address, "--port", str(_find_port(arguments.port)), *host, *quiet]
+            from kineverse.view.server import find_free_port
+
+            # Now, so that a page that is started again has the same address.
+            port = find_free_port(arguments.host or "127.0.0.1", arguments.port)
+            commands[VIEW] = ["view", address, "--port", str(port), *host, *quiet]
         self.supervisor = Supervisor(self.name, commands, folder, ending=(BEHAVE,), prepare=self._prepare)
         self._stills: LiveStills | None = None
+        self._records = False
         self._stack = ExitStack()
         self._screen = Screen(self, sys.stderr if arguments.json else sys.stdout)
 
@@ -256,6 +262,7 @@ class LiveSystem:
             about = {"robot": self.robot.name, "world": self._arguments.world, "noise": self._arguments.noise}
             recorder = StreamRecorder(self._arguments.record, connection, self.model, about)
             self._stack.enter_context(recorder)
+            self._records = True
 
     def watch(self, until: float) -> None:
         """Watch all processes until a time of the clock that only counts [s], or until all is done."""
@@ -374,7 +381,7 @@ class LiveSystem:
         print(", ".join(numbers), flush=True)
         if shown is not None:
             print(f"picture: {shown}", flush=True)
-        if arguments.record is not None:
+        if self._records:
             print(f"recording: {arguments.record}", flush=True)
 
 
@@ -398,16 +405,6 @@ def _choose_name(wanted: str | None) -> str:
     while (name := "live" if number == 1 else f"live-{number}") in taken:
         number += 1
     return name
-
-
-def _find_port(wanted: int | None) -> int:
-    """Return a port that is free, so that a page that is started again has the same address."""
-    for port in [wanted] if wanted is not None else range(_FIRST_PORT, _FIRST_PORT + _PORTS):
-        with socket.socket() as probe, suppress(OSError):
-            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            probe.bind(("127.0.0.1", port))
-            return port
-    raise InvalidValueError(f"--port {wanted or _FIRST_PORT}: another process has it.")
 
 
 def _choose_objects(
@@ -527,11 +524,13 @@ class Screen:
     def _draw(self, status: LiveStatus) -> None:
         from kineverse.live.live_status import describe_all  # for start-up time
 
-        supervisor, width = self._system.supervisor, shutil.get_terminal_size().columns - 1
+        supervisor = self._system.supervisor
+        columns, height = shutil.get_terminal_size()
+        width = columns - 1
         lines = [f"{SCHEME}{self._system.name}   {self._address}".rstrip()]
         lines += self._list_processes(status, width)
         lines += [join_lines(line) for line in describe_all(supervisor.reader)]
-        lines.append(self._answer or _KEYS)
+        lines = [*lines[: max(height - 2, 0)], self._answer or _KEYS]  # no higher, else it would scroll
         up = f"\033[{self._height}A" if self._height else ""
         text = "".join(f"\033[2K{shorten_text(line, width)}\n" for line in lines)
         below = "\033[J"
@@ -566,6 +565,7 @@ class Screen:
             if self._kills and key.isdigit():
                 self._kills = False
                 children = [*supervisor.children.values()]
+                self._answer = f"There is no process {key}."
                 if 1 <= int(key) <= len(children):
                     children[int(key) - 1].kill()
                     self._answer = f"killed: {children[int(key) - 1].name}"

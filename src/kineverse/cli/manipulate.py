@@ -32,6 +32,7 @@ from .outside_robot import OutsideRobot, check_world, is_outside, refuse_start
 from .pages import (
     add_page_options,
     check_picture_path,
+    check_recording_path,
     handle_interrupts,
     list_mesh_problems,
     page_options,
@@ -305,10 +306,7 @@ def _check(arguments: argparse.Namespace, skill: str) -> None:
     if arguments.noise is not None:
         Sensors.parse(arguments.noise)  # says at once what cannot be read
     check_picture_path(arguments.picture)
-    if arguments.record is not None:
-        from kineverse.worlds.recorder import check_recording_name  # for start-up time
-
-        check_recording_name(arguments.record)
+    check_recording_path(arguments.record)
 
 
 def _make_world(arguments: argparse.Namespace, scene: ManipulationScene) -> SimulatedWorld:

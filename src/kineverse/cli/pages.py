@@ -78,6 +78,16 @@ def check_picture_path(path: str | None) -> None:
     check_file_path(path)
 
 
+def check_recording_path(path: str | None) -> None:
+    """Raise unless a recording can be written, before the work; None stands for no recording."""
+    if path is None:
+        return
+    from kineverse.worlds.recorder import check_recording_name  # for start-up time
+
+    check_recording_name(path)
+    check_file_path(path)
+
+
 def check_file_path(path: str) -> None:
     """Raise OSError unless a file can be written, without leaving an empty one if the run is interrupted."""
     new = not os.path.lexists(path)

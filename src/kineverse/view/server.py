@@ -77,7 +77,7 @@ def start(port: int | None = None, label: str = "", host: str = HOST) -> Any:
             return any(buffer.message_counter - 1 > last for last in buffer.generator_cursors.values())
 
     with suppress_console():
-        server = LocalServer(host=host, port=_free_port(host, port), label=label, verbose=False)
+        server = LocalServer(host=host, port=find_free_port(host, port), label=label, verbose=False)
     if not gate.installed:
         stop(server)
         raise KineverseError(
@@ -191,7 +191,14 @@ def _replace_global(function: Any, name: str, thing: Any) -> Any:
     return copy
 
 
-def _free_port(host: str, port: int | None) -> int:
+def find_free_port(host: str, port: int | None = None) -> int:
+    """Return the port itself if it is free, and without one the preferred or any free port of a host.
+
+    Raises
+    ------
+    InvalidValueError
+        If the port is none or is taken, or there is no such host.
+    """
     if port is not None and not 0 <= port <= 65535:
         raise InvalidValueError(f"{port} is not a port; ports are numbers from 0 (any free one) to 65535")
     try:
