@@ -10,12 +10,9 @@ import pytest
 
 import kineverse as kv
 from kineverse.articulations import Ackermann
-from kineverse.errors import SimulationError
 from kineverse.grasping import find_handle
 from kineverse.manipulation import (
-    OpenCloseRunner,
     Session,
-    find_articulated_objects,
     judge_outcome,
     open_object,
     stand_at_handle,
@@ -95,45 +92,6 @@ def test_nothing_is_done_where_bodies_overlapped_on_the_way(world):
     assert outcome.claimed
     assert "overlapped" in outcome.reason
     assert outcome.measures["failure"] == "collision"
-
-
-def test_several_objects_are_opened_and_closed(world):
-    objects = [one for one in find_articulated_objects(world.model, "robot") if one.coordinate.path == DRAWER]
-    runner = OpenCloseRunner(world, start(world.model), belief=TrueBelief(world))
-    report = runner.open_and_close(objects[0])
-    assert report, report.reason
-    assert report.opened.value == pytest.approx(0.4, abs=0.03)
-    assert report.closed.value == world.state[DRAWER] == pytest.approx(0.0, abs=0.03)
-    assert report.estimate_error == 0.0
-    assert report.grasp_error < 1e-3
-    assert len(report.steps) > 100
-    assert not report.pushed
-
-
-class Unstable(KinematicWorld):
-    """World that cannot be trusted any more from 1 s on, until its first reset after that."""
-
-    failed, healed = False, False
-
-    def reset(self, state):
-        self.healed = self.failed
-        super().reset(state)
-
-    def apply(self, speeds, duration, *, stamp=None):
-        if self.time > 1.0 and not self.healed:
-            self.failed = True
-            raise SimulationError("It has exploded.")
-        super().apply(speeds, duration, stamp=stamp)
-
-
-def test_objects_after_a_simulation_that_failed_are_opened(world):
-    unstable = Unstable(world.model, "robot")
-    objects = [one for one in find_articulated_objects(world.model, "robot") if one.coordinate.path == DRAWER]
-    runner = OpenCloseRunner(unstable, start(world.model), belief=TrueBelief(unstable))
-    first, second = (runner.open_and_close(objects[0]) for _ in range(2))
-    assert not first
-    assert "It has exploded." in first.reason
-    assert second, second.reason
 
 
 @pytest.fixture(scope="module")

@@ -24,8 +24,6 @@ if TYPE_CHECKING:
     from .belief import TrackedBelief as TrackedBelief
     from .trials import (
         JudgedOutcome as JudgedOutcome,
-        OpenCloseReport as OpenCloseReport,
-        OpenCloseRunner as OpenCloseRunner,
         judge_outcome as judge_outcome,
         stand_at_handle as stand_at_handle,
     )
