@@ -26,7 +26,7 @@ help:
 	@echo "make ros     an environment with ROS 2, .venv/ros, for kineverse ros without an installation of it"
 	@echo "make sanitize  all C with sanitizers, and the tests that use it (ARGS=--short: a little of each)"
 	@echo "make fuzz    look for inputs that break a reader (ARGS='--target sdf --minutes 60')"
-	@echo "make faults  damage files of model servers and kill their processes (ARGS='store --damages 1000')"
+	@echo "make faults  damage files of model servers, cut networks, kill and freeze processes (ARGS=live: of a moving robot)"
 	@echo "make format  format the code and mend what the linter can mend"
 	@echo "make clean   remove the environment and what the tools left"
 

@@ -30,7 +30,8 @@ class DocumentedTable:
     rules
         Rule of each column of the page; the page has these columns in this order.
     short
-        Short form of the command; None for benchmarks, whose rows alone are compared, in ``tests/bench``.
+        Short form of the command; None for benchmarks, whose rows alone are compared, in ``tests/bench``,
+        and for what takes its time, of which ``tests/live`` has a short form.
     has_all_rows
         False if the short form has some of the rows.
     data
@@ -315,6 +316,29 @@ MANIPULATION = (
         "Control steps [ms]",
         {"robot": KEY, **dict.fromkeys(("CPU mean", "median", "p99", "worst"), TIME)},
         _KITCHEN,
+    ),
+    DocumentedTable(
+        "live",
+        "experiments.md",
+        "kineverse reproduce live",
+        "Opened and closed in real time",
+        {
+            "robot": KEY,
+            "object": KEY,
+            **dict.fromkeys(("skills", "done"), SAME),
+            **dict.fromkeys(
+                (
+                    "time of one [s]",
+                    "error of the estimate [mm], [mrad]",
+                    "force [N]",
+                    "reading to estimate [ms]",
+                    "real-time factor",
+                    "late steps [%]",
+                    "restarts",
+                ),
+                Unchecked("it is measured in real time, in half an hour"),
+            ),
+        },
     ),
     _table_of_trials(
         "push",
