@@ -9,7 +9,7 @@ from lock_step import LockStep
 
 import kineverse as kv
 from kineverse.errors import UnknownNameError
-from kineverse.live import Closer, OpenByName, Tour
+from kineverse.live import Closer, OpenByName, Tour, behaviours
 from kineverse.worlds import KinematicWorld, TrueBelief
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "worlds"))
@@ -178,6 +178,36 @@ def test_a_tour_opens_and_closes_each_as_often_as_wanted_and_goes_on_as_closer()
     assert max(highest) == pytest.approx(0.2, abs=0.02)
     assert tour.note.behaviour == "closer"
     assert not tour.is_done
+
+
+def test_an_object_that_an_edit_takes_away_is_told_and_the_behaviour_goes_on(monkeypatch):
+    _, sessions = make(room__drawer=0.3)
+    behaviour = Tour(sessions, patterns=[DRAWER, "room/door"], far=0.5)
+    found = behaviours.find_articulated_objects
+
+    def take_away(session):
+        if session.phase == "move" and not sessions.version:
+            sessions.version += 1
+            without = lambda *a: [one for one in found(*a) if str(one.coordinate) != DRAWER]  # noqa: E731
+            monkeypatch.setattr(behaviours, "find_articulated_objects", without)
+
+    sessions.on_step = take_away
+    run_until(behaviour, is_watching(behaviour))
+    assert sessions.version
+    assert behaviour.note.why == "All is shut."
+    told = [one.skill for one in behaviour.note.results if one.reason == "The model has it no longer."]
+    assert told == ["open", "close"]
+    monkeypatch.setattr(behaviours, "find_articulated_objects", lambda *_: [])
+    sessions.version += 1
+    behaviour.step()
+    run_until(behaviour, lambda: "none of the objects" in behaviour.note.why)
+
+
+def test_names_that_are_missing_are_left_out_if_that_is_wanted():
+    _, sessions = make()
+    closer = Closer(sessions, patterns=["room/lid", DRAWER], missing_ok=True)
+    run_until(closer, is_watching(closer))
+    assert [*closer.scene.names] == [DRAWER]
 
 
 def test_a_robot_that_is_away_is_waited_for_and_a_wrong_name_is_not():

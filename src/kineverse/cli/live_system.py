@@ -218,11 +218,12 @@ class LiveSystem:
         brief = arguments.headless and arguments.what is None and arguments.far == 1.0
         far = ["--far", str(_BRIEFLY if brief else arguments.far)]
         rounds = ["--rounds", str(arguments.rounds)]
+        behave = ["behave", address, "--missing-ok"]  # it is to outlive that somebody deletes an object
         commands = {
             SERVE: ["serve", model, *served, *store],
             WORLD: [*world, *guard, *truth, "--kept", str(folder / "world.state")],
             TRACK: ["track", address, *robot, *noise],
-            BEHAVE: ["behave", address, *robot, *seed, *far, *rounds, "--do", self.do, "--what", *self.names],
+            BEHAVE: [*behave, *robot, *seed, *far, *rounds, "--do", self.do, "--what", *self.names],
         }
         if not arguments.headless or self.do == _UNKNOWN:
             commands[LEARN] = ["learn", address]
