@@ -192,13 +192,7 @@ def _replace_global(function: Any, name: str, thing: Any) -> Any:
 
 
 def find_free_port(host: str, port: int | None = None) -> int:
-    """Return the port itself if it is free, and without one the preferred or any free port of a host.
-
-    Raises
-    ------
-    InvalidValueError
-        If the port is none or is taken, or there is no such host.
-    """
+    """Return the port itself if it is free, and without one the preferred or any free port of a host."""
     if port is not None and not 0 <= port <= 65535:
         raise InvalidValueError(f"{port} is not a port; ports are numbers from 0 (any free one) to 65535")
     try:
