@@ -58,6 +58,15 @@ def test_a_port_that_is_taken_is_said(run) -> None:
     assert f"port {port} is taken" in err
 
 
+@pytest.mark.usefixtures("extras")
+def test_a_server_of_somebody_else_is_left_alone(run, monkeypatch) -> None:
+    monkeypatch.setattr(live_system, "list_servers", lambda: ["home", "live"])
+    monkeypatch.setattr("kineverse.live.supervisor.Supervisor.start", lambda _: pytest.fail("it has started"))
+    status, _, err = run("live", "--name", "home", "--headless")
+    assert status == 2
+    assert "home: a model server of that name is running already" in err
+
+
 class _Terminal(io.StringIO):
     def isatty(self) -> bool:
         return True

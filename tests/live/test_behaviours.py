@@ -9,6 +9,7 @@ from lock_step import LockStep
 
 import kineverse as kv
 from kineverse.errors import UnknownNameError
+from kineverse.live import behaviours
 from kineverse.live.behaviours import Closer, OpenByName, Tour
 from kineverse.worlds import KinematicWorld, TrueBelief
 
@@ -178,6 +179,35 @@ def test_a_tour_opens_and_closes_each_as_often_as_wanted_and_goes_on_as_closer()
     assert max(highest) == pytest.approx(0.2, abs=0.02)
     assert tour.note.behaviour == "closer"
     assert not tour.is_done
+
+
+def test_an_object_that_an_edit_takes_away_is_told_and_the_behaviour_goes_on(monkeypatch):
+    _, sessions = make(room__door=1.5)
+    opening = OpenByName(sessions, patterns=[DRAWER, "room/door"])
+    found = behaviours.find_articulated_objects
+
+    def take_away(session):
+        if session.phase == "move" and not sessions.version:
+            sessions.version += 1
+            without = lambda *a: [one for one in found(*a) if str(one.coordinate) != DRAWER]  # noqa: E731
+            monkeypatch.setattr(behaviours, "find_articulated_objects", without)
+
+    sessions.on_step = take_away
+    run_until(opening, lambda: opening.is_done)
+    assert sessions.version
+    told = [(one.what, one.done, one.reason) for one in opening.note.results]
+    assert told[0] == (DRAWER, False, "The model has it no longer.")
+    assert [what for what, *_ in told] == [DRAWER, "room/door"]
+
+
+def test_names_that_are_missing_are_left_out_if_that_is_wanted():
+    _, sessions = make()
+    closer = Closer(sessions, patterns=["room/lid", DRAWER], missing_ok=True)
+    run_until(closer, is_watching(closer))
+    assert [*closer.scene.names] == [DRAWER]
+    without = Closer(sessions, patterns=["room/lid"], missing_ok=True)
+    run_until(without, is_watching(without))
+    assert without.note.why == "The model has none of the objects that were asked for."
 
 
 def test_a_robot_that_is_away_is_waited_for_and_a_wrong_name_is_not():

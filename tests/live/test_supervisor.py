@@ -65,11 +65,9 @@ def test_what_is_killed_is_started_again_after_a_pause(make, monkeypatch):
 
 def test_what_ends_again_and_again_is_given_up_with_what_it_said(make, monkeypatch):
     monkeypatch.setattr(children, "_PAUSE", 0.0)
-    child = make("import sys; print('kineverse: no such robot', file=sys.stderr); sys.exit(2)")
+    child = make("import sys; print('kineverse: no such robot.', file=sys.stderr); sys.exit(2)")
     child.start()
-    with pytest.raises(
-        GivenUpError, match=r"'world' has ended 5 times within 30 s: kineverse: no such robot\.$"
-    ):
+    with pytest.raises(GivenUpError, match=r"'world' has ended 5 times within 30 s: no such robot\.$"):
         until(lambda: child.watch() and False)
     assert child.ends == 5
 

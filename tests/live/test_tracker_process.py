@@ -133,6 +133,13 @@ def test_nonsense_is_passed_over_and_named(scene):
     assert "another version" in scene.tracker.find_problem()
 
 
+def test_what_prevents_it_and_its_end_are_told_once(scene):
+    told, problems = [], ["no world", "no world", "", "", "another version"]
+    scene.tracker.find_problem = lambda: problems.pop(0)
+    scene.tracker.run(lambda: not problems, told.append)
+    assert told == ["no world", "There are readings.", "another version"]
+
+
 def test_after_an_edit_it_goes_on_with_what_was_believed(scene):
     scene.look(0.2, 5)
     with scene.live.edit() as edit:

@@ -332,6 +332,9 @@ def _add_behave_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--what", nargs="+", metavar="NAME", help="objects by name or pattern ('*_door') (all)"
     )
+    parser.add_argument(
+        "--missing-ok", action="store_true", help="leave out names that the model does not have"
+    )
     add_far_option(parser)
     add_rounds_option(parser)
     parser.add_argument("--hand", metavar="FRAME", help="hand of the robot (the likeliest gripper)")
@@ -369,6 +372,7 @@ def _run_behave(arguments: argparse.Namespace) -> int:
                 sessions,
                 **rounds,
                 patterns=arguments.what,
+                missing_ok=arguments.missing_ok,
                 report=report,
                 hand=arguments.hand,
                 seed=arguments.seed,

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from kineverse.errors import InvalidValueError, KineverseError
+from kineverse.errors import DuplicateNameError, InvalidValueError, KineverseError
 from kineverse.exchange.address import SCHEME, check_server_name, list_servers
 
 from .arguments import require
@@ -218,11 +218,12 @@ class LiveSystem:
         brief = arguments.headless and arguments.what is None and arguments.far == 1.0
         far = ["--far", str(_BRIEFLY if brief else arguments.far)]
         rounds = ["--rounds", str(arguments.rounds)]
+        behave = ["behave", address, "--missing-ok"]  # it is to outlive that somebody deletes an object
         commands = {
             SERVE: ["serve", model, *served, *store],
             WORLD: [*world, *guard, *truth, "--kept", str(folder / "world.state")],
             TRACK: ["track", address, *robot, *noise],
-            BEHAVE: ["behave", address, *robot, *seed, *far, *rounds, "--do", self.do, "--what", *self.names],
+            BEHAVE: [*behave, *robot, *seed, *far, *rounds, "--do", self.do, "--what", *self.names],
         }
         if not arguments.headless or self.do == _UNKNOWN:
             commands[LEARN] = ["learn", address]
@@ -398,10 +399,14 @@ def _load(source: str) -> Model:
 
 
 def _choose_name(wanted: str | None) -> str:
-    """Return the name of the server: the wanted one, or the first that is free."""
+    """Return the name of the server: the wanted one if nobody has it, or the first that is free."""
+    taken, number = {*list_servers()}, 1
+    if wanted is not None and wanted in taken:  # else all would work for the server of somebody else
+        raise DuplicateNameError(
+            f"--name {wanted}: a model server of that name is running already. Use another name, or none."
+        )
     if wanted is not None:
         return wanted
-    taken, number = {*list_servers()}, 1
     while (name := "live" if number == 1 else f"live-{number}") in taken:
         number += 1
     return name

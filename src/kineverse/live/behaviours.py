@@ -16,6 +16,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from kineverse.errors import KineverseError, UnknownNameError
+from kineverse.geometry.objects import matches_pattern
 from kineverse.grasping import Gripper, Handle, find_handle
 from kineverse.manipulation import (
     ArticulatedObject,
@@ -116,6 +117,9 @@ class Behaviour:
         Seed of all searches.
     far
         Share of the whole way by which things are opened.
+    missing_ok
+        Whether names that the model does not have are left out, instead of an error. Those that an edit
+        takes away meanwhile always are.
 
     Attributes
     ----------
@@ -139,8 +143,9 @@ class Behaviour:
         seconds: float = 90.0,
         seed: int = 0,
         far: float = 1.0,
+        missing_ok: bool = False,
     ) -> None:
-        self._far = far
+        self._far, self._missing_ok = far, missing_ok
         self._sessions, self._report, self._hand = sessions, report, hand
         self._patterns = None if patterns is None else tuple(patterns)
         self._seconds, self.seed = seconds, seed
@@ -186,13 +191,13 @@ class Behaviour:
         self.session = None
         try:
             session = self._sessions.open(self._look, self._search)
-            self.scene = Furniture.of(session, self._patterns, self._hand)
+            self.scene = Furniture.of(session, self._patterns, self._hand, self._missing_ok)
         except UnknownNameError:
             raise  # of what was asked for
         except KineverseError as error:
             self._wait("waits", str(error))
             return None
-        self.session, self._is_hand_checked = session, False
+        self.session, self._is_hand_checked, self._missing_ok = session, False, True
         return session
 
     def _find_problem(self, session: Session) -> str:
@@ -269,9 +274,11 @@ class Behaviour:
 
     def add_result(self, task: Task, done: bool, reason: str, seconds: float = 0.0) -> None:
         """Tell the result of a task."""
-        skill = "open" if task.opening else "close"
-        result = SkillResult(str(task.object.coordinate), skill, done, reason, seconds)
-        note = self.note
+        self._tell(str(task.object.coordinate), task.opening, done, reason, seconds)
+
+    def _tell(self, what: str, opening: bool, done: bool, reason: str, seconds: float = 0.0) -> None:
+        skill, note = "open" if opening else "close", self.note
+        result = SkillResult(what, skill, done, reason, seconds)
         note.results = [*note.results, result][-_MOST_RESULTS:]
         note.done, note.failed = note.done + done, note.failed + (not done)
         note.last = (
@@ -351,14 +358,18 @@ class Furniture:
         return cls((), {}, None)
 
     @classmethod
-    def of(cls, session: Session, patterns: Iterable[str] | None, hand: str | None) -> Furniture:
-        """Return the objects of some patterns, by default all but knobs; UnknownNameError without any."""
+    def of(
+        cls, session: Session, patterns: Iterable[str] | None, hand: str | None, missing_ok: bool = False
+    ) -> Furniture:
+        """Return the objects of some patterns, by default all but knobs; UnknownNameError for a wrong one."""
         model, robot = session.model, session.robot
         found = find_articulated_objects(model, None if robot.is_mechanism else robot)
         if patterns is None:
             chosen = tuple(one for one in found if one.kind != "knob")
         else:
-            chosen = select_objects(found, patterns)
+            names = [str(one.coordinate) for one in found]
+            wanted = [p for p in patterns if not missing_ok or any(matches_pattern(n, [p]) for n in names)]
+            chosen = select_objects(found, wanted)
         handles = {}
         for one in found:
             try:
@@ -455,6 +466,8 @@ class Closer(Behaviour):
         if best is not None:
             return best[1]
         texts = [*waiting, *unseen]
+        if not self.scene.objects:
+            texts = ["The model has none of the objects that were asked for."]
         more = f" And {len(texts) - 2} more." if len(texts) > 2 else ""
         self._wait("watches", (" ".join(texts[:2]) + more) or "All is shut.")
         return None
@@ -484,7 +497,8 @@ class Agenda(Closer):
         name, opening = self._left[0]
         one = self.scene.names.get(name)
         if one is None:
-            self._give_up(None, "The model has it no longer.")
+            self._tell(name, opening, False, "The model has it no longer.")
+            self._next()
             return None
         why = "It was asked for." if not self._tries else f"This is try {self._tries + 1}."
         task = Task(one, opening, why, far=self._far)
@@ -509,9 +523,8 @@ class Agenda(Closer):
             return None
         return task
 
-    def _give_up(self, task: Task | None, reason: str) -> None:
-        if task is not None:
-            self.add_result(task, False, reason)
+    def _give_up(self, task: Task, reason: str) -> None:
+        self.add_result(task, False, reason)
         self._next()
 
     def _next(self) -> None:

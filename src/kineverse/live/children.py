@@ -127,12 +127,13 @@ class Child:
         return True
 
     def describe_end(self) -> str:
-        """Return how it has ended the last time; empty if it has not."""
+        """Return how it has ended the last time, without a final dot; empty if it has not."""
         if self.status is None:
             return ""
         if self.status < 0:
             return f"killed by {signal.Signals(-self.status).name}"
-        return self.read_last_line() or f"exit status {self.status}"
+        said = self.read_last_line().removeprefix("kineverse: ").removesuffix(".")
+        return said or f"exit status {self.status}"
 
     def read_last_line(self) -> str:
         """Return the last line that it printed; empty without any."""

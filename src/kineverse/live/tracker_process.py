@@ -67,15 +67,14 @@ class TrackerProcess:
         is_over: Callable[[], bool] = lambda: False,
         on_problem: Callable[[str], object] = lambda _: None,
     ) -> None:
-        """Track until it is over; what prevents it is told once."""
+        """Track until it is over; what prevents it is told once, and when it is over."""
         told = ""
         while not is_over():
             if self._reader.wait(0.1):
                 self.step()
             if (problem := self.find_problem()) != told:
                 told = problem
-                if problem:
-                    on_problem(problem)
+                on_problem(problem or "There are readings.")
 
     def find_problem(self) -> str:
         """Return why nothing can be tracked; empty if there are readings."""
