@@ -67,7 +67,9 @@ def test_what_ends_again_and_again_is_given_up_with_what_it_said(make, monkeypat
     monkeypatch.setattr(children, "_PAUSE", 0.0)
     child = make("import sys; print('kineverse: no such robot.', file=sys.stderr); sys.exit(2)")
     child.start()
-    with pytest.raises(GivenUpError, match=r"'world' has ended 5 times within 30 s: no such robot\.$"):
+    with pytest.raises(
+        GivenUpError, match=r"'world' has ended 5 times within 20 s of its start: no such robot\.$"
+    ):
         until(lambda: child.watch() and False)
     assert child.ends == 5
 

@@ -45,6 +45,7 @@ _TRIES = 3  # of an object that is opened or closed by name, or on a tour
 _REST = 0.1  # time between two looks while nothing is done [s]
 _LETTING_GO = 30.0  # longest time to let go of something [s]
 _LATE, _SEARCHED = 0.005, 1.0  # lateness of a step that counts, and time beyond which it was a search [s]
+_AJAR = 0.2  # share of their way by which fingers that are open may be closed
 _SHOWN = 3  # steps between two reports
 _MOST_RESULTS = 64
 
@@ -288,14 +289,22 @@ class Behaviour:
 
     def _let_go(self, session: Session) -> bool:
         """Let go of what the hand may hold, as after a skill that was broken off; return if all is clear."""
-        handle = self.scene.find_held(session)
+        handle, is_away = self.scene.find_held(session), False
         if handle is None:
-            return True
-        self._say("lets go", f"The hand is at '{handle.frame}', as after a skill that was broken off.")
+            if self.scene.is_hand_open(session):
+                return True
+            # It may hold what the model has no longer.
+            handle, is_away = next(iter(self.scene.handles.values())), True
+            self._say("opens the hand", "Nobody knows what it holds.")
+        else:
+            self._say("lets go", f"The hand is at '{handle.frame}', as after a skill that was broken off.")
         run = SkillRun(session, handle.coordinate, _LETTING_GO)
         motion = self.scene.motion(run, handle, self.seed)
 
         def let_go() -> str:
+            if is_away:
+                motion.move_fingers(motion.gripper.opened)
+                return "The hand is open."
             motion.let_go()
             return "The hand is away."
 
@@ -306,7 +315,8 @@ class Behaviour:
             self._acts = False
         if not outcome and self._find_interruption(session, session.model):
             return False
-        self.note.last = f"let go of '{handle.frame}': {outcome.reason}"
+        if not is_away:
+            self.note.last = f"let go of '{handle.frame}': {outcome.reason}"
         return True
 
     # -- what is told ----------------------------------------------------------------------------------------
@@ -407,6 +417,15 @@ class Furniture:
         if not len(touching):
             return None
         return next(iter(self.handles.values()))  # whose frame the way back is described in
+
+    def is_hand_open(self, session: Session) -> bool:
+        """Return whether the fingers are about as open as they can be, or are of no use."""
+        if self.gripper is None or not self.handles:
+            return True
+        opened, closed, state = self.gripper.opened, self.gripper.closed, session.state
+        return all(
+            abs(opened[s] - state[s]) <= _AJAR * abs(opened[s] - closed[s]) for s in self.gripper.joints
+        )
 
     def find_unseen(self, session: Session, one: ArticulatedObject) -> str:
         """Return why nothing is decided about an object; empty if it is seen."""

@@ -10,7 +10,6 @@ import subprocess
 import sys
 import threading
 import time
-from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -19,7 +18,8 @@ from typing import Final
 from kineverse.errors import KineverseError
 
 _PAUSE, _MOST_PAUSE = 0.5, 8.0  # first and longest time until what has ended is started again [s]
-_MOST_ENDS, _WITHIN = 5, 30.0  # number of ends within a time [s] after which a process is given up
+_MOST_ENDS, _SHORT = 5, 20.0
+"""Number of ends in a row, each within a time of its start [s], after which a process is given up."""
 _STOPPING = 3.0  # longest time that a process is given to end [s]
 _DEATH_SIGNAL: Final = 1  # of Linux: PR_SET_PDEATHSIG
 _WATCHING = 0.5  # time between two looks at the parent where no signal tells of its end [s]
@@ -68,7 +68,7 @@ class Child:
         self.log = Path(folder) / f"{name}.log"
         self.status: int | None = None  # exit status of the last end
         self.ends, self.is_done = 0, False  # number of unwanted ends; whether it has ended by itself
-        self._may_end, self._recent = may_end, deque[float](maxlen=_MOST_ENDS)
+        self._may_end, self._failures = may_end, 0
         self._process: subprocess.Popen[bytes] | None = None
         self._due = 0.0  # when it is started again
         self.started = -math.inf
@@ -112,14 +112,14 @@ class Child:
                 self.is_done = True
                 return False
             self.ends += 1
-            self._recent.append(now)
-            recent = [end for end in self._recent if now - end < _WITHIN]
-            if len(recent) >= _MOST_ENDS:
+            # Of those only that have hardly lived, however long a start takes on a machine that is busy.
+            self._failures = self._failures + 1 if now - self.started < _SHORT else 1
+            if self._failures >= _MOST_ENDS:
                 raise GivenUpError(
-                    f"'{self.name}' has ended {len(recent)} times within {_WITHIN:g} s: "
+                    f"'{self.name}' has ended {self._failures} times within {_SHORT:g} s of its start: "
                     f"{self.describe_end()}."
                 )
-            self._due = now + min(_PAUSE * 2.0 ** (len(recent) - 1), _MOST_PAUSE)
+            self._due = now + min(_PAUSE * 2.0 ** (self._failures - 1), _MOST_PAUSE)
         if self.is_done or now < self._due:
             return False
         self.prepare()
