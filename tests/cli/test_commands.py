@@ -265,7 +265,8 @@ def test_a_missing_compiler_is_reported_only_with_verbose(run, monkeypatch, tmp_
     # What was not found on one path is logged once, so there are two.
     monkeypatch.setenv("PATH", str(tmp_path / "first"))
     status, _, err = run(*words)
-    assert (status, err) == (0, "")
+    assert status == 0
+    assert "no C compiler" not in err
     monkeypatch.setenv("PATH", str(tmp_path / "second"))
     status, _, err = run("--verbose", *words)
     assert status == 0

@@ -43,6 +43,7 @@ PATIENCE = 10.0  # time that an edit waits for a server that went away, before i
 _ASK_TIMEOUT = 5.0
 _PAUSE = 0.005
 _ROUTING = 0.5
+_LOOKING = 2.0  # longest time to find out whether a server that does not answer is there [s]
 _SETTLING = 1.0  # time in which sources announce themselves to a server that has started [s]
 
 A = TypeVar("A")
@@ -400,7 +401,7 @@ class Connection:
 
     def _explain_silence(self) -> str:
         server = f"The server {self.address.name!r}"
-        if self.user and self.is_online and self.transport.is_alive(self.key("alive/*"), _ROUTING):
+        if self.user and self.is_online and self.transport.is_alive(self.key("alive/*"), _LOOKING):
             return (
                 f"{server} is there, and does not answer the user {self.user!r}: rights.toml of the server, "
                 "or of the relay, does not name this user, or has been changed since the start."
