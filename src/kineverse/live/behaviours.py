@@ -295,7 +295,7 @@ class Behaviour:
                 return True
             # It may hold what the model has no longer.
             handle, is_away = next(iter(self.scene.handles.values())), True
-            self._say("opens the hand", "Nobody knows what it holds.")
+            self._say("opens the hand", "It may hold something.")
         else:
             self._say("lets go", f"The hand is at '{handle.frame}', as after a skill that was broken off.")
         run = SkillRun(session, handle.coordinate, _LETTING_GO)
