@@ -8,7 +8,6 @@ import math
 import os
 import signal
 import subprocess
-import sys
 import threading
 import time
 from collections.abc import Iterator, Sequence
@@ -32,6 +31,7 @@ from kineverse.live.streams import (
     decode,
     read_note,
 )
+from kineverse_studies.experiments.live import started
 
 from .processes import folder, wait_until
 
@@ -116,7 +116,7 @@ class Watch(threading.Thread):
                 self.robot.append((newest.stamp, note.commanded, newest.values))
             truth = self.reader.newest(TRUTH)
             if truth is not None and _is_new(self.truth, truth.stamp):
-                values = dict(zip(truth.names, truth.values.tolist(), strict=True))
+                values = truth.named
                 place = self._place([values[str(s)] for s in self._place.inputs])
                 self.truth.append((truth.stamp, values[self._what], np.array(place).ravel()))
             doing = read_note(self.reader, ACTIVITY, ActivityNote)
@@ -152,25 +152,16 @@ def try_faults(setting: Setting, faults: Sequence[Fault], most: float = 1.0) -> 
     with folder() as path:
         output, model = Path(path, "output"), Path(path, "model.kv.json")
         setting.model.save(model)
-        words = [str(model), "--robot", setting.robot, "--world", setting.world, "--do", "tour", "--far", "1"]
-        words += ["--what", setting.what, "--headless", "--json", "--name", "fault"]
-        command = [sys.executable, "-m", "kineverse", "live", *words, "--seconds", str(FINISHING)]
-        with output.open("w", encoding="utf-8") as out:
-            system = subprocess.Popen(command, stdout=out, stderr=subprocess.STDOUT, cwd=path)
-        try:
+        words = ["live", str(model), "--robot", setting.robot, "--world", setting.world, "--do", "tour"]
+        words += ["--far", "1", "--what", setting.what, "--headless", "--json", "--name", "fault"]
+        words += ["--seconds", str(FINISHING)]
+        with started(words, output, stderr=subprocess.STDOUT, cwd=path) as system:
             watch = Watch(_connect(system, output), setting.what, setting.handle)
             watch.start()
             found = [_send(fault, watch, system, output, most) for fault in faults]
             _finish(faults, system, output)
             watch.over = True
             return found
-        finally:
-            if system.poll() is None:
-                system.send_signal(signal.SIGINT)
-                with suppress(subprocess.TimeoutExpired):
-                    system.wait(20.0)
-            system.kill()
-            system.wait()
 
 
 def make_kitchen() -> kv.Model:

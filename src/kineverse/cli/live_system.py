@@ -18,8 +18,6 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from kineverse.errors import DuplicateNameError, InvalidValueError, KineverseError
 from kineverse.exchange.address import SCHEME, check_server_name, list_servers
 
@@ -450,7 +448,7 @@ class LiveStills:
         if note is None or truth is None:
             return
         self.state = truth
-        way = np.frombuffer(note.way).reshape(-1, 3) if len(note.way) % 24 == 0 and note.way else None
+        way = note.read_way()
         reference = None if way is None else SimpleNamespace(ahead=way)
         step: Any = SimpleNamespace(state=belief or truth, phase=note.phase, reference=reference)
         for one in status.results[self._told :]:
@@ -465,8 +463,7 @@ class LiveStills:
         newest = self._supervisor.reader.newest(source)
         if newest is None:
             return None
-        named = zip(newest.names, newest.values.tolist(), strict=True)
-        return self._default.updated({self._known[n]: v for n, v in named if n in self._known})
+        return self._default.updated({self._known[n]: v for n, v in newest.named.items() if n in self._known})
 
     def save(self, path: str) -> bool:
         """Write the picture, and return True; False if there is nothing to show."""

@@ -212,6 +212,11 @@ class Newest(NamedTuple):
     note: bytes  # what the source has said beside it
     arrival: float  # time at which it came in, by the clock that only counts [s]
 
+    @property
+    def named(self) -> dict[str, float]:
+        """The values by name."""
+        return dict(zip(self.names, self.values.tolist(), strict=True))
+
 
 class StateReader(Closing):
     """Newest values of all sources that it follows, merged by coordinate.

@@ -324,7 +324,7 @@ class Behaviour:
     def _say(self, doing: str, why: str) -> None:
         note = self.note
         note.behaviour, note.doing, note.why = self.name, doing, why
-        note.phase, note.way, note.wanted, note.vectors, note.pairs = "", b"", b"", {}, []
+        note.phase, note.way, note.wanted, note.vectors = "", b"", b"", {}
         self._report(note)
 
     def _search(self, text: str) -> None:
@@ -340,7 +340,7 @@ class Behaviour:
         note.late += session.dt + _LATE < gap < _SEARCHED
         self._stepped, self._phase = now if session.commands else -np.inf, session.phase
         if note.steps % _SHOWN == 0:
-            reference, contact = session.reference, session.contact
+            reference = session.reference
             note.phase = session.phase
             note.way = b"" if reference is None else np.ascontiguousarray(reference.ahead).tobytes()
             note.wanted = b"" if reference is None else np.ascontiguousarray(reference.pose).tobytes()
@@ -348,7 +348,6 @@ class Behaviour:
                 name: np.array([origin, vector], dtype=float).tobytes()
                 for name, (origin, vector) in session.vectors.items()
             }
-            note.pairs = [] if contact is None else [[list(contact.pusher), list(contact.pushed)]]
             self._report(note)
         if self._acts and self.heeds_edits and not self._sessions.is_current(session):
             raise SkillError("other", "The model was edited, so all is planned anew.")

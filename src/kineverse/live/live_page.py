@@ -14,8 +14,6 @@ from dataclasses import dataclass, field
 from types import SimpleNamespace
 from typing import Any
 
-import numpy as np
-
 from kineverse._runtime import Closing
 from kineverse.exchange import LiveModel
 from kineverse.exchange.state import Newest, StateReader
@@ -40,6 +38,7 @@ from .streams import (
     ActivityNote,
     LearnerNote,
     SupervisorNote,
+    as_array,
     read_note,
 )
 
@@ -49,7 +48,6 @@ _TABLE = 0.5  # time between two tables [s]
 _STOPPING = 0.1  # longest time between two looks after a stop was asked for [s]
 _UNWATCHED = 1.0  # time between two drawings while nobody looks [s]
 _SHOWN = (TRUTH, ROBOT, TRACKER)  # sources that place the bodies, the best first
-_DOUBLES = np.dtype(float).itemsize
 
 
 @dataclass
@@ -83,7 +81,7 @@ def read_truth(reader: StateReader) -> dict[str, float]:
     for source in reversed(_SHOWN):
         newest = reader.newest(source)
         if newest is not None:
-            found.update(zip(newest.names, newest.values.tolist(), strict=True))
+            found.update(newest.named)
     return found
 
 
@@ -96,22 +94,9 @@ def read_step(reader: StateReader, truth: Mapping[str, float], begin: float) -> 
     latest = max((n.stamp for n in map(reader.newest, _SHOWN) if n is not None), default=begin)
     belief, tracked = truth, reader.newest(TRACKER)
     if tracked is not None:
-        belief = dict(truth) | dict(zip(tracked.names, tracked.values.tolist(), strict=True))
-    vectors = {name: _as_array(data, (2, 3)) for name, data in activity.vectors.items()}
-    known = {name: (ends[0], ends[1]) for name, ends in vectors.items() if ends is not None}
-    way, wanted = _as_array(activity.way, (-1, 3)), _as_array(activity.wanted, (4, 4))
-    reference = SimpleNamespace(ahead=way, pose=wanted)
-    return StreamStep(latest - begin, belief, known, reference)
-
-
-def _as_array(data: bytes, shape: tuple[int, int]) -> Array | None:
-    """Return doubles as an array of a shape; None if there are none, or as many as do not fit."""
-    count = len(data) // _DOUBLES
-    fits = count == shape[0] * shape[1] if shape[0] > 0 else count % shape[1] == 0
-    if not count or len(data) % _DOUBLES or not fits:
-        return None
-    found = np.frombuffer(data).reshape(shape)
-    return found if np.isfinite(found).all() else None
+        belief = dict(truth) | tracked.named
+    reference = SimpleNamespace(ahead=activity.read_way(), pose=as_array(activity.wanted, (4, 4)))
+    return StreamStep(latest - begin, belief, activity.read_vectors(), reference)
 
 
 def choose_pause(rate: float, spent: float, *, is_urgent: bool = False) -> float:

@@ -25,13 +25,12 @@ from kineverse.worlds import Observation, Robot
 from kineverse.worlds.speed_commands import parse_speeds
 
 from .streams import (
-    CAMERA,
     COMMANDS,
     ROBOT,
     TICK,
     TRACKER,
-    CameraNote,
     CommandNote,
+    ObservationReader,
     RobotNote,
     TrackerNote,
     decode,
@@ -86,7 +85,8 @@ class LiveRobot:
         columns |= {v: k for k, v in enumerate(self._speeds)}
         self._columns = columns | {str(v): k for v, k in columns.items()}
         self._symbols = {str(s): s for s in self.robot.coordinates}
-        self._number, self._picture, self._now = 0, -1, -math.inf
+        self._observations = ObservationReader(self.reader)
+        self._number, self._now = 0, -math.inf
         self.planned: Mapping[str, float] = {}
         self._observation = Observation(-math.inf, {})
         try:
@@ -213,16 +213,8 @@ class LiveRobot:
         note = None if newest is None else decode(newest.note, RobotNote)
         if newest is None or note is None:
             return None
-        poses, seen = {}, self._observation.seen
-        picture = self.reader.newest(CAMERA)
-        if picture is not None and newest.stamp > self._observation.stamp:
-            shown = decode(picture.note, CameraNote)
-            if shown is not None and shown.picture != self._picture:
-                self._picture, poses, seen = shown.picture, shown.read(), picture.stamp
         if newest.stamp > self._observation.stamp:
-            named = zip(newest.names, newest.values.tolist(), strict=True)
-            joints = {self._symbols[name]: value for name, value in named if name in self._symbols}
-            self._observation = Observation(newest.stamp, joints, poses, frozenset(note.touching), seen)
+            self._observation = self._observations.read(newest, note.touching, self._symbols)
         return note
 
 
@@ -263,8 +255,7 @@ class LiveBelief:
         if newest is None or note is None:
             return self._state
         self._note = note
-        named = dict(zip(newest.names, newest.values.tolist(), strict=True))
-        values = {self._symbols[name]: value for name, value in named.items() if name in self._symbols}
+        values = {self._symbols[name]: value for name, value in newest.named.items() if name in self._symbols}
         self._state = State({**self._state, **values}, stamp=newest.stamp, source=TRACKER)
         deviations = np.frombuffer(note.deviations).tolist()
         known = zip(newest.names, deviations, strict=False)

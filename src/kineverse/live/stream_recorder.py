@@ -6,7 +6,7 @@ import logging
 import os
 import threading
 from collections.abc import Mapping
-from typing import Any
+from dataclasses import replace
 
 import numpy as np
 
@@ -15,18 +15,16 @@ from kineverse.errors import KineverseError
 from kineverse.exchange import Connection
 from kineverse.exchange.state import Newest
 from kineverse.model.model_view import ModelView
-from kineverse.worlds import Observation
 from kineverse.worlds.recorder import Recorder
 
 from .streams import (
     ACTIVITY,
-    CAMERA,
     COMMANDS,
     ROBOT,
     TRACKER,
     TRUTH,
     ActivityNote,
-    CameraNote,
+    ObservationReader,
     RobotNote,
     decode,
 )
@@ -53,11 +51,11 @@ class StreamRecorder(Closing):
         self._recorder = Recorder(path, model, about)
         self._known = {str(s): s for s in model.symbols}
         self._reader = connection.reader()
+        self._observations = ObservationReader(self._reader)
         self._stamps: dict[str, float] = {}
         self._origin: float | None = None
         self._told = 0  # results that were written
         self._phase: str | None = None
-        self._picture = -1
         self._is_over = threading.Event()
         self._thread = threading.Thread(target=self._run, daemon=True, name="recorder")
         self._thread.start()
@@ -107,18 +105,12 @@ class StreamRecorder(Closing):
         return max(0.0, newest.stamp - self._origin)
 
     def _select(self, newest: Newest) -> dict[str, float]:
-        named = zip(newest.names, newest.values.tolist(), strict=True)
-        return {name: value for name, value in named if name.partition(":")[0] in self._known}
+        return {name: value for name, value in newest.named.items() if name.partition(":")[0] in self._known}
 
     def _write_readings(self, robot: Newest) -> None:
-        note, poses, picture = decode(robot.note, RobotNote), {}, self._reader.newest(CAMERA)
-        shown = None if picture is None else decode(picture.note, CameraNote)
-        if shown is not None and shown.picture != self._picture:
-            self._picture, poses = shown.picture, shown.read()
-        joints = {self._known[name]: v for name, v in self._select(robot).items() if name in self._known}
-        touching = frozenset(() if note is None else note.touching)
-        observation = Observation(self._time(robot), joints, poses, touching)
-        self._recorder.write_observation(self._time(robot), observation)
+        note, time = decode(robot.note, RobotNote), self._time(robot)
+        observation = self._observations.read(robot, () if note is None else note.touching, self._known)
+        self._recorder.write_observation(time, replace(observation, stamp=time))
 
     def _write_activity(self, time: float) -> None:
         newest = self._reader.newest(ACTIVITY)
@@ -130,12 +122,7 @@ class StreamRecorder(Closing):
             self._phase = phase
             self._recorder.write_phase(time, phase)
         if note.vectors:
-            vectors: dict[str, Any] = {}
-            for name, data in note.vectors.items():
-                if len(data) == 6 * np.dtype(float).itemsize:
-                    origin, vector = np.frombuffer(data).reshape(2, 3)
-                    vectors[name] = origin, vector
-            self._recorder.write_vectors(time, vectors)
+            self._recorder.write_vectors(time, note.read_vectors())
         if (number := note.done + note.failed) > self._told:
             self._told = number
             self._recorder.write_outcome({"done": not note.failed, "reason": note.last})

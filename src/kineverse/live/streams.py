@@ -7,7 +7,7 @@ stamps are times of the robot, which is the clock of the world's computer.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, Final, TypeAlias, TypeVar
 
 import msgspec
@@ -15,8 +15,10 @@ import numpy as np
 
 from kineverse.errors import KineverseError
 from kineverse.exchange.protocol import encode as encode
-from kineverse.exchange.state import StateReader
+from kineverse.exchange.state import Newest, StateReader
 from kineverse.lie import Array
+from kineverse.symbols import Symbol
+from kineverse.worlds import Observation
 
 ROBOT: Final = "robot"  # source of encoders, touch sensors and guards
 CAMERA: Final = "camera"  # source of poses of visible markers
@@ -110,8 +112,16 @@ class ActivityNote(msgspec.Struct, array_like=True):
     last: str = ""  # result of the last skill
     steps: int = 0  # control steps, in all
     late: int = 0  # those that began late by more than 5 ms, in all
-    pairs: list[list[list[str]]] = []  # bodies that the skill means to bring together
     results: list[SkillResult] = []  # of the last skills
+
+    def read_way(self) -> Array | None:
+        """Return the points (k, 3) of the way [m]; None without any."""
+        return as_array(self.way, (-1, 3))
+
+    def read_vectors(self) -> dict[str, tuple[Array, Array]]:
+        """Return the vectors (3,) by name, each after its origin in the world [m]."""
+        found = {name: as_array(data, (2, 3)) for name, data in self.vectors.items()}
+        return {name: (ends[0], ends[1]) for name, ends in found.items() if ends is not None}
 
 
 class ProcessRow(msgspec.Struct, array_like=True):
@@ -186,6 +196,33 @@ def decode(data: bytes, kind: type[Note]) -> Note | None:
         return msgspec.msgpack.decode(data, type=kind)
     except msgspec.MsgspecError:
         return None
+
+
+def as_array(data: bytes, shape: tuple[int, int]) -> Array | None:
+    """Return doubles as an array of a shape; None if there are none, or as many as do not fit."""
+    count, left = divmod(len(data), np.dtype(float).itemsize)
+    fits = count == shape[0] * shape[1] if shape[0] > 0 else count % shape[1] == 0
+    if not count or left or not fits:
+        return None
+    found = np.frombuffer(data).reshape(shape)
+    return found if np.isfinite(found).all() else None
+
+
+class ObservationReader:
+    """Reader of what a robot says, and of each picture of its camera once."""
+
+    def __init__(self, reader: StateReader) -> None:
+        self._reader, self._picture = reader, -1
+
+    def read(self, robot: Newest, touching: Iterable[str], symbols: Mapping[str, Symbol]) -> Observation:
+        """Return the readings in a robot's vector, those of known names, with the picture that is new."""
+        poses: dict[str, Array] = {}
+        seen, picture = None, self._reader.newest(CAMERA)
+        shown = None if picture is None else decode(picture.note, CameraNote)
+        if picture is not None and shown is not None and shown.picture != self._picture:
+            self._picture, poses, seen = shown.picture, shown.read(), picture.stamp
+        joints = {symbols[name]: value for name, value in robot.named.items() if name in symbols}
+        return Observation(robot.stamp, joints, poses, frozenset(touching), seen)
 
 
 def read_note(reader: StateReader, source: str, kind: type[Note]) -> Note | None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
@@ -13,16 +14,15 @@ from kineverse.model.commits.follower import follow
 from kineverse.model.model_view import ModelView
 from kineverse.state import State
 from kineverse.symbols import Symbol, parse_symbol_name
-from kineverse.worlds import Observation, Sensors
+from kineverse.worlds import Sensors
 
 from .streams import (
-    CAMERA,
     COMMANDS,
     ROBOT,
     TICK,
     TRACKER,
-    CameraNote,
     CommandNote,
+    ObservationReader,
     RobotNote,
     TrackerNote,
     decode,
@@ -49,18 +49,20 @@ class TrackerProcess:
         self._robot, self._sensors = robot, sensors
         self._follower = follow(live, self._make)
         self.belief, self._version = self._follower.current
-        self._symbols = self._list_symbols()
+        self._list_symbols()
         self._reader = live.exchange.reader()
+        self._observations = ObservationReader(self._reader)
         self._publisher = live.exchange.publisher(TRACKER, self._symbols)
-        self._picture, self._stamp, self._ticks = -1, 0.0, 0
+        self._stamp, self._ticks = 0.0, 0
 
     def _make(self, model: ModelView) -> TrackedBelief:
         belief = TrackedBelief(model, self._robot, self._sensors)
         belief.tracker.wait()
         return belief
 
-    def _list_symbols(self) -> list[Symbol]:
-        return [s for s in self._follower.value.model.symbols if not s.order]
+    def _list_symbols(self) -> None:
+        self._symbols = [s for s in self.belief.model.symbols if not s.order]
+        self._known = {str(s): s for s in self._symbols}
 
     def run(
         self,
@@ -94,17 +96,11 @@ class TrackerProcess:
             return False
         self._follow()
         before, self._stamp = self._stamp, newest.stamp
-        model, poses, seen = self.belief.model, {}, None
-        known = {str(s): s for s in self._symbols}
-        named = zip(newest.names, newest.values.tolist(), strict=True)
-        joints = {known[name]: value for name, value in named if name in known}
-        picture = self._reader.newest(CAMERA)
-        if picture is not None:
-            shown = decode(picture.note, CameraNote)
-            if shown is not None and shown.picture != self._picture:
-                self._picture, seen = shown.picture, picture.stamp
-                poses = {name: pose for name, pose in shown.read().items() if name in model.frames}
-        observation = Observation(newest.stamp, joints, poses, frozenset(note.touching), seen)
+        observation = self._observations.read(newest, note.touching, self._known)
+        if observation.poses:
+            frames = self.belief.model.frames
+            poses = {name: pose for name, pose in observation.poses.items() if name in frames}
+            observation = replace(observation, poses=poses)
         state = self.belief.update(observation, newest.stamp, self._read_commands(before, newest.stamp, note))
         self._ticks = note.ticks
         self._publish(state, newest.stamp, 1e3 * (time.perf_counter() - begin))
@@ -123,7 +119,7 @@ class TrackerProcess:
         moved = (robot.ticks - self._ticks) * TICK
         acted = newest.stamp + (robot.timeout if note.stamped else note.duration) - begin
         share = min(1.0, max(0.0, min(moved, acted) / (end - begin)))
-        values = dict(zip(newest.names, newest.values.tolist(), strict=True)) | note.planned
+        values = newest.named | note.planned
         return State({Symbol(*parse_symbol_name(name)): share * value for name, value in values.items()})
 
     def _publish(self, state: State, stamp: float, milliseconds: float) -> None:
@@ -140,10 +136,10 @@ class TrackerProcess:
         before = self.belief
         self.belief, self._version = self._follower.current
         self.belief.take_over(before)
-        symbols = self._list_symbols()
+        symbols = self._symbols
+        self._list_symbols()
         if symbols != self._symbols:
-            self._symbols = symbols
-            self._publisher.set_coordinates(symbols)
+            self._publisher.set_coordinates(self._symbols)
 
     def close(self) -> None:
         """End the stream."""

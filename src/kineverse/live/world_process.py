@@ -132,6 +132,7 @@ class WorldProcess:
         self._finger_names = {
             str(s.derivative()) for gripper in self.world.robot.grippers for s in gripper.joints
         }
+        self._speed_names = {str(v) for v in self.world.robot.speeds}
         self._rest = dict.fromkeys(self._finger_names, 0.0)
 
     # -- what is asked ---------------------------------------------------------------------------------------
@@ -231,12 +232,11 @@ class WorldProcess:
             until = arrived + max(note.duration, TICK)
         if not now < until + 1e-9 or newest.stamp > now + TICK:
             return self._rest
-        speeds = dict(zip(newest.names, newest.values.tolist(), strict=True))
+        speeds = newest.named
         for k in note.kept:
             speeds[newest.names[k]] = self._fingers.get(newest.names[k], 0.0)
         self._fingers = {name: speeds[name] for name in self._finger_names if name in speeds}
-        known = {str(v) for v in self.world.robot.speeds}
-        return {name: value for name, value in speeds.items() if name in known}
+        return {name: value for name, value in speeds.items() if name in self._speed_names}
 
     def _publish(self, now: float) -> None:
         world, observation = self.world, self.world.observe()

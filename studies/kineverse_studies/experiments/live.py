@@ -132,7 +132,7 @@ def make_object(thing: GraspedObject) -> Model:
 
 
 @contextmanager
-def _started(words: Sequence[str], output: Path, **options: Any) -> Iterator[subprocess.Popen[bytes]]:
+def started(words: Sequence[str], output: Path, **options: Any) -> Iterator[subprocess.Popen[bytes]]:
     """Start a command of kineverse, whose output goes to a file, and end it."""
     python = options.pop("python", sys.executable)
     with output.open("w", encoding="utf-8") as out:
@@ -163,7 +163,7 @@ def run_processes(job: LiveJob) -> RealTimeRun:
         ]  # fmt: skip
         if job.record is not None:
             words += ["--record", str(job.record / f"{job.robot}-{job.thing.name.replace(' ', '-')}.mcap")]
-        process = stack.enter_context(_started(words, output, cwd=folder))
+        process = stack.enter_context(started(words, output, cwd=folder))
         try:
             _watch(found, process, what)
             process.wait(_STARTING)
@@ -189,8 +189,8 @@ def _watch(found: RealTimeRun, process: subprocess.Popen[bytes], what: str) -> N
             note, doing = read_note(reader, ROBOT, RobotNote), read_note(reader, ACTIVITY, ActivityNote)
             if truth is None or belief is None or note is None:
                 continue
-            true = dict(zip(truth.names, truth.values.tolist(), strict=True))[what]
-            believed = dict(zip(belief.names, belief.values.tolist(), strict=True))[what]
+            true = truth.named[what]
+            believed = belief.named[what]
             tracker = read_note(reader, TRACKER, TrackerNote)
             if tracker is not None:
                 found.estimate.append(tracker.milliseconds)
@@ -226,7 +226,7 @@ def run_topics(job: LiveJob) -> RealTimeRun:
         model = folder / "object.kv.json"
         make_object(job.thing).save(model)
         words = ["ros", model.name, "--robot", job.robot, "--simulate", "mujoco", "--noise", job.noise]
-        robot = stack.enter_context(_started(words, folder / "robot", cwd=folder, python=python))
+        robot = stack.enter_context(started(words, folder / "robot", cwd=folder, python=python))
         for skill in ("open", "close") * job.rounds:
             words = [skill, model.name, "--robot", job.robot, "--what", what, "--world", "ros", "--json"]
             words += ["--seed", str(job.seed), "--seconds", "120"]
