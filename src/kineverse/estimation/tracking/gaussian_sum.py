@@ -3,25 +3,23 @@
 Each group has its own components. They are kept until the evidence of one exceeds that of the others by far
 (Alspach and Sorenson, Nonlinear Bayesian estimation using Gaussian sum approximations, 1972).
 
-Mirror images predict the same measurements from different states and stay apart. Points along an unobservable
-ridge also predict the same; the ridge covariance covers them, so they are merged.
+Mirror images predict the same measurements from different states and stay apart.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
-from kineverse.estimation.linear_algebra import inverse_spd
 from kineverse.lie import Array
 from kineverse.symbols import Symbol
 
 from .information_state import InformationState
-from .observability import Components, RidgeCovariance
+from .observability import Components
 from .state_space import CoordinateGroup, Layout
 
 MOST_COMPONENTS = 8  # largest number of components of a group
@@ -40,7 +38,6 @@ class Candidate:
     dof: Array  # its degrees of freedom
     groups: Sequence[int]  # numbers of the groups
     predicted: Array | None = None  # predicted measurements there, once they are wanted
-    covariances: dict[int, Array] = field(default_factory=dict)
 
 
 class GaussianSum:
@@ -131,9 +128,8 @@ _SAME_PREDICTION, _NEAR = 0.3, 3.0
 class MergeCriterion:
     """Criterion for two candidates that are one component."""
 
-    def __init__(self, components: Components, ridge_covariance: RidgeCovariance) -> None:
+    def __init__(self, components: Components) -> None:
         self._layout, self._residuals, self._process_model, self._reader, *_ = components
-        self._ridge_covariance = ridge_covariance
 
     def should_merge(
         self,
@@ -157,17 +153,8 @@ class MergeCriterion:
                 change[k] = math.remainder(change[k], periods[x])
         # Between both states, to first order.
         step = np.linalg.pinv(self._process_model.basis(number, here, inputs)) @ change
-        bound = _NEAR**2 * len(step)
-        if float(step @ other.belief.information[group.block] @ step) < bound:
-            return True
-        record, known = one.belief.records[number], other.belief.records[number]
-        if record is None or known is None:
-            return False
-        if min(record.count, known.count) > 1 and record.branch is not known.branch:
-            return False  # separate components of earlier updates
-        if number not in other.covariances:
-            other.covariances[number] = self._ridge_covariance.compute(number, other.belief)
-        return float(step @ inverse_spd(other.covariances[number]) @ step) < bound
+        squared = float(step @ other.belief.information[group.block] @ step)
+        return squared < _NEAR**2 * len(step)
 
     def _predicted(self, one: Candidate, inputs: Array) -> Array:
         if one.predicted is None:

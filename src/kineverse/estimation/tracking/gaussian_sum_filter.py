@@ -71,7 +71,7 @@ class UpdateStep:
         components = Components(*shared, self.solver.group_bounds, self.unobservable)
         self.static_batch = StaticBatch(components, self._solve, outliers is not None)
         self.ridge_covariance = RidgeCovariance(components)
-        self.merge_criterion = MergeCriterion(components, self.ridge_covariance)
+        self.merge_criterion = MergeCriterion(components)
         self.stationary_points = StationaryPoints(components)
         self.periods: Mapping[Symbol, float] = {}
         self.counted: frozenset[Symbol] = frozenset()

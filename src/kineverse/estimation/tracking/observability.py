@@ -19,7 +19,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
@@ -177,8 +177,6 @@ class StaticRecord:
     means: Mapping[int, MeanMeasurement]  # averaged measurements, by number of the observation
     inputs: Array  # values of the inputs during these measurements
     evidence: float  # log evidence of the group before these measurements
-    count: int = 0  # number of updates
-    branch: object = field(default_factory=object)  # identity of the first update
 
     def with_measurements(
         self, new: Mapping[int, MeanMeasurement], observations: Sequence[MeasurementModel]
@@ -187,7 +185,7 @@ class StaticRecord:
         means = dict(self.means)
         for i, one in new.items():
             means[i] = means[i].combine(one, observations[i]) if i in means else one
-        return replace(self, means=means, count=self.count + 1)
+        return replace(self, means=means)
 
     def as_measurements(self, layout: Layout, reader: MeasurementReader) -> Measurements:
         """Return the averaged measurements as one reading."""
@@ -232,7 +230,7 @@ class StaticBatch:
                 continue
             if old is None:
                 record = StaticRecord(
-                    result.prior.group_cost(group.t), new, inputs, float(before.evidence[number]), 1
+                    result.prior.group_cost(group.t), new, inputs, float(before.evidence[number])
                 )
                 after.records[number] = record
                 continue
