@@ -122,8 +122,8 @@ def check_observations(
 
 
 PosesLike: TypeAlias = "npt.ArrayLike | tuple[npt.ArrayLike, npt.ArrayLike]"
-"""Poses (N, 4, 4), or a pair of poses and covariance: a common one, see :mod:`.pose_checks`, or (N, 6, 6) with
-one for each pose. Where points are accepted, positions (N, 3)."""
+"""Poses (N, 4, 4), or a pair of poses and covariance: a common one, see :mod:`.pose_checks`, or (N, 6, 6) of
+each pose. Where points are accepted, positions (N, 3)."""
 
 
 @dataclass(frozen=True)
