@@ -20,9 +20,8 @@ from kineverse.estimation.linear_algebra import inverse_spd
 from kineverse.lie import Array
 from kineverse.symbols import Symbol
 
-from .covariance import RidgeCovariance
 from .information_state import InformationState
-from .observability import Components
+from .observability import Components, RidgeCovariance
 from .state_space import CoordinateGroup, Layout
 
 MOST_COMPONENTS = 8  # largest number of components of a group
@@ -36,11 +35,11 @@ class Candidate:
     """Candidate component for some groups."""
 
     belief: InformationState  # belief after the update
-    predicted: Array  # predicted measurements there
-    weights: Array | None  # inlier weight of each observation; None if all are 1
+    weights: Array  # inlier weight of each observation
     nis: Array  # normalised innovation squared of each group
     dof: Array  # its degrees of freedom
     groups: Sequence[int]  # numbers of the groups
+    predicted: Array | None = None  # predicted measurements there, once they are wanted
     covariances: dict[int, Array] = field(default_factory=dict)
 
 
@@ -146,8 +145,9 @@ class MergeCriterion:
     ) -> bool:
         """Return True if two candidates predict the same measurements of a group from nearby states."""
         empty = self._reader.empty()
-        predicted = empty._replace(values=self._reader.as_values(other.predicted), mask=~empty.mask)
-        errors = self._residuals.errors(one.predicted, predicted, group.observation_indices)
+        predicted, out = self._predicted(one, inputs), self._predicted(other, inputs)
+        as_predicted = empty._replace(values=self._reader.as_values(out), mask=~empty.mask)
+        errors = self._residuals.errors(predicted, as_predicted, group.observation_indices)
         if any(float(e @ e) >= _SAME_PREDICTION**2 for e, _ in errors.values()):
             return False
         number, here = self._layout.groups.index(group), other.belief.x[group.x]
@@ -168,3 +168,8 @@ class MergeCriterion:
         if number not in other.covariances:
             other.covariances[number] = self._ridge_covariance.compute(number, other.belief)
         return float(step @ inverse_spd(other.covariances[number]) @ step) < bound
+
+    def _predicted(self, one: Candidate, inputs: Array) -> Array:
+        if one.predicted is None:
+            one.predicted = self._residuals.evaluate(one.belief.x, inputs)
+        return one.predicted

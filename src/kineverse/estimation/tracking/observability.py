@@ -1,14 +1,23 @@
-"""Batch relinearisation of measurements while the state is static.
+"""Unobservable directions: restarts, averaged measurements, and covariance along a curved ridge.
 
 A filter sums information that was linearised at different estimates. An arm with seven joints can move while
 its end effector rests. The direction of this null motion differs a little between estimates, so the sum holds
 false information about an unobservable direction. While the state is static, measurements are instead
 averaged on SE(3), and the posterior follows from the prior and these means, linearised at one point. This is
 needed only while the group has unobservable directions.
+
+One measured point of a body in the plane determines the position of this point but not the angle: the
+possible states form a ring. A Gaussian covers the tangent of the ring only and would place the truth within
+the noise of that. At the next estimate the tangent differs, and the intersection of two tangents would pass
+for information along the ring. :class:`RidgeCovariance` therefore widens the Gaussian by the second moment of
+the curvature. Second-order filters add the same to each measurement (Athans, Wishner and Bertolini,
+Suboptimal state estimation for continuous-time nonlinear systems, 1968).
 """
 
 from __future__ import annotations
 
+import itertools
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple, TypeAlias
@@ -21,7 +30,7 @@ from kineverse.lie import Array, pose_difference, retract
 
 from .bounds import GroupBounds
 from .information_state import InformationState, QuadraticCost
-from .map_update import MapResult, MapSolver
+from .map_update import MapResult
 from .measurements import MeasurementModel, wrap_difference
 from .process_model import ProcessModel
 from .residuals import MeasurementReader, Measurements, Residuals, whitening
@@ -73,7 +82,7 @@ _MOST_DIRECTIONS = 2  # restarts are limited to the directions of least informat
 def find_unexplained(result: MapResult) -> list[int]:
     """Return the groups whose residuals exceed the noise."""
     beyond = result.nis > result.dof + _EXPLAINED * np.sqrt(2 * result.dof)
-    return np.flatnonzero(beyond).tolist()
+    return np.flatnonzero(beyond).tolist() if beyond.any() else []
 
 
 def move_origin(
@@ -194,9 +203,9 @@ class StaticRecord:
 class StaticBatch:
     """Batch relinearisation for the groups of a tracker."""
 
-    def __init__(self, components: Components, solver: MapSolver, update: UpdateFunction) -> None:
+    def __init__(self, components: Components, update: UpdateFunction, has_outliers: bool) -> None:
         self._layout, self._residuals, _, self._reader, _, self._unobservable = components
-        self._solver, self._update = solver, update
+        self._update, self._has_outliers = update, has_outliers
         # In a group with one direction, linearisation at several estimates adds no false information.
         self._groups = {number for number, group in enumerate(self._layout.groups) if len(group.t) > 1}
 
@@ -209,35 +218,36 @@ class StaticBatch:
         groups: Sequence[int] | None = None,
     ) -> None:
         """Recompute an update from all stored measurements where a group has unobservable directions."""
-        after, weights = result.belief, result.weights
+        after, weights = result.belief, result.weights.tolist()
         for number in self._groups if groups is None else self._groups.intersection(groups):
             group, old = self._layout.groups[number], before.records[number]
+            if old is None and not self._unobservable.is_in(number, after):
+                continue
             new = {
-                i: self._mean_measurement(i, reading, 1.0 if weights is None else float(weights[i]))
+                i: self._mean_measurement(i, reading, weights[i])
                 for i in group.observation_indices
-                if reading.mask[i] and (weights is None or weights[i] > _LEAST_WEIGHT)
+                if reading.mask[i] and weights[i] > _LEAST_WEIGHT
             }
-            if not new or (old is None and not self._unobservable.is_in(number, after)):
+            if not new:
                 continue
-            is_first = old is None
-            old = old or StaticRecord(before.group_cost(group.t), {}, inputs, float(before.evidence[number]))
+            if old is None:
+                record = StaticRecord(
+                    result.prior.group_cost(group.t), new, inputs, float(before.evidence[number]), 1
+                )
+                after.records[number] = record
+                continue
             record = old.with_measurements(new, self._layout.observations)
-            if is_first and (result.priors is not None or not group.by_speeds):
-                prior = self._transport_prior(number, before, old.prior, result)
-                after.records[number] = replace(record, prior=prior)
-                continue
             batch = self._solve_batch(number, before, record)
             after.x[group.x] = batch.belief.x[group.x]
             after.set_group_cost(group.t, batch.belief.group_cost(group.t))
-            if weights is None:
+            if not self._has_outliers:
                 after.evidence[number] = batch.belief.evidence[number]
             # Observations still to come may show that the estimate is a mirror image: keep the record.
             is_complete = len(record.means) == len(group.observation_indices)
             if is_complete and not self._unobservable.is_in(number, after):
                 after.records[number] = None
             else:
-                prior = self._transport_prior(number, before, record.prior, batch)
-                after.records[number] = replace(record, prior=prior)
+                after.records[number] = replace(record, prior=batch.prior.group_cost(group.t))
 
     def add_noise(
         self, number: int, before: InformationState, after: InformationState, added_variance: Array
@@ -275,14 +285,79 @@ class StaticBatch:
         first = before.copy()
         first.set_group_cost(group.t, record.prior)
         first.evidence[number] = record.evidence
-        # The C code does not return the transport of the tangent space.
-        update = self._solver.update if group.by_speeds else self._update
-        return update(first, record.as_measurements(self._layout, self._reader), record.inputs, [number])
+        return self._update(
+            first, record.as_measurements(self._layout, self._reader), record.inputs, [number]
+        )
 
-    def _transport_prior(
-        self, number: int, before: InformationState, prior: QuadraticCost, result: MapResult
-    ) -> QuadraticCost:
-        if result.priors is not None:
-            return result.priors[number]
-        group = self._layout.groups[number]
-        return prior.transported(result.belief.x[group.x] - before.x[group.x], None)
+
+_STRAIGHT = 0.02  # a ridge that deviates from its tangent by less, in deviations across it, is straight
+
+
+class RidgeCovariance:
+    """Covariance that contains the curved ridge of a posterior with unobservable directions."""
+
+    def __init__(self, components: Components) -> None:
+        self._layout, self._residuals, self._process_model = components[:3]
+        self._reader, self._group_bounds, self._unobservable = components[3:]
+
+    def compute(self, number: int, belief: InformationState) -> Array:
+        """Return the second moment of the posterior of a group about its estimate (t, t)."""
+        covariance = inverse_spd(belief.information[self._layout.groups[number].block])
+        if belief.records[number] is None:
+            return covariance
+        bends = self._bends(number, belief, covariance)
+        return np.asarray(covariance + bends.T @ bends)
+
+    def inflate(self, number: int, belief: InformationState) -> None:
+        """Inflate the Gaussian of a group to this covariance, and drop its static record; in place."""
+        t, block = self._layout.groups[number].t, self._layout.groups[number].block
+        mean = inverse_spd(belief.information[block]) @ belief.vector[t]
+        belief.information[block] = inverse_spd(self.compute(number, belief))
+        belief.vector[t] = belief.information[block] @ mean
+        belief.records[number] = None
+
+    def is_straight(self, number: int, belief: InformationState) -> bool:
+        """Return True if the measurements of a group are linear within its belief."""
+        information = belief.information[self._layout.groups[number].block]
+        bends = self._bends(number, belief, inverse_spd(information))
+        return bool(np.einsum("ij,jk,ik->i", bends, information, bends).max(initial=0.0) < _STRAIGHT**2)
+
+    def _bends(self, number: int, belief: InformationState, covariance: Array) -> Array:
+        """Return steps whose outer products add up to the second moment of the curvature of the ridge (m, t).
+
+        A step Σ aₖ uₖ along its tangent, with a ~ N(0, 1), leaves the ridge by Σ aₖ aₗ dₖₗ + Σ aₖ³ oₖ.
+        """
+        group, record, x = self._layout.groups[number], belief.records[number], belief.x
+        assert record is not None
+        bounds, inputs, measured = self._group_bounds[number], record.inputs, list(record.means)
+        here = self._residuals.evaluate(x, inputs)
+        reading = record.as_measurements(self._layout, self._reader)
+        reading = reading._replace(values=self._reader.as_values(here))
+        slopes = {i: s for i, (_, s) in self._residuals.errors(here, reading, measured).items()}
+
+        def off_ridge(along: Array) -> Array:
+            """Return the step back to the ridge from the end of a step along its tangent."""
+            there = x.copy()
+            try:
+                after, _ = self._process_model.retract(number, x[group.x], along, inputs)
+                there[group.x] = bounds.clip(after)
+                errors = self._residuals.errors(self._residuals.evaluate(there, inputs), reading, measured)
+            except KineverseError:  # infeasible
+                return np.zeros(len(along))
+            left = bounds.remaining(x[group.x], there[group.x], along)
+            pull = sum(slopes[i].T @ (error + slopes[i] @ left) for i, (error, _) in errors.items())
+            return covariance @ pull if np.isfinite(pull).all() else np.zeros(len(along))
+
+        directions, _ = self._unobservable.directions(number, belief.information[group.block])
+        sides = np.array([[off_ridge(one), off_ridge(-one)] for one in directions]).reshape(
+            -1, 2, len(covariance)
+        )
+        even, odd = (sides[:, 0] + sides[:, 1]) / 2, (sides[:, 0] - sides[:, 1]) / 2
+        pairs = itertools.combinations(range(len(even)), 2)
+        mixed = [
+            (off_ridge(one) + off_ridge(-one)) / 2 - even[k] - even[m]
+            for k, m in pairs
+            for one in [directions[k] + directions[m]]
+        ]
+        rows = [math.sqrt(2.0) * even, even.sum(axis=0)[None], math.sqrt(15.0) * odd]
+        return np.concatenate([*rows, np.reshape(mixed, (-1, len(covariance)))])
