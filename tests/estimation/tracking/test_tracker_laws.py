@@ -410,7 +410,7 @@ def test_solve_bounded_qp_equals_nonnegative_least_squares():
         inside = rows @ rng.standard_normal(n)
         low, high = inside - rng.uniform(0, 1, m), inside + rng.uniform(0, 1, m)
         low[rng.random(m) < 0.3] = -np.inf
-        x = solve_bounded_qp(np.linalg.inv(A), g, rows, low, high)
+        x = solve_bounded_qp(A, -g, rows, low, high)
         assert (rows @ x >= low - 1e-8).all()
         assert (rows @ x <= high + 1e-8).all()
         # Karush-Kuhn-Tucker: the gradient is a combination of active rows with the correct signs.
