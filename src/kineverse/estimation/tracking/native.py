@@ -63,7 +63,7 @@ class NativeMapSolver:
         )
         self._motions = [solver.process_model.flow(number) for number in range(count)]
         is_varying = [np.empty(0) if m is None else m.is_varying.reshape(-1) for m in self._motions]
-        self._size, self._is_linear = size, not solver.process_model.has_rates
+        self._size, self._is_linear = size, not (solver.process_model.has_rates or layout.limits)
         limits = [layout.limit_slices[k].start for group in groups for k in group.limits]
         indices: dict[str, Any] = {
             "is_pose": [one.is_pose for one in layout.observations],
@@ -182,7 +182,7 @@ class NativeMapSolver:
     def predict(
         self, belief: InformationState, displacement: Array, added_variance: Array
     ) -> InformationState | None:
-        """Predict a belief inside bounds of single coordinates; None unless these are the tangent."""
+        """Predict a belief inside its bounds; None for rates, curved limits, or on any difficulty."""
         if not self._is_linear:
             return None
         with self._lock:
