@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 import numpy.typing as npt
@@ -16,18 +15,17 @@ from kineverse.lie import Array
 from kineverse.symbols import Symbol
 
 from .bounds import StateBounds
-from .gaussian_sum import PRUNING_LOG_RATIO, Candidate, GaussianSum, MergeCriterion
+from .gaussian_sum import PRUNING_LOG_RATIO, Candidate, GaussianSum
 from .information_state import InformationState
 from .map_update import Loss, MapResult, MapSolver
 from .native import NativeMapSolver, native_library
 from .observability import (
-    Components,
     RidgeCovariance,
     StaticBatch,
-    StationaryPoints,
     UnobservableDirections,
     find_unexplained,
     move_origin,
+    restart_states,
 )
 from .process_model import ConstantVelocity, ProcessModel, Speeds
 from .residuals import MeasurementReader, Measurements, Residuals
@@ -67,12 +65,7 @@ class UpdateStep:
         suits = NativeMapSolver.suits(layout)
         self.native = NativeMapSolver(self.solver, self.function) if suits else None
         self.unobservable = UnobservableDirections(layout)
-        shared = layout, self.residuals, self.process_model, self.reader
-        components = Components(*shared, self.solver.group_bounds, self.unobservable)
-        self.static_batch = StaticBatch(components, self._solve, outliers is not None)
-        self.ridge_covariance = RidgeCovariance(components)
-        self.merge_criterion = MergeCriterion(components, self.ridge_covariance)
-        self.stationary_points = StationaryPoints(components)
+        self.static_batch, self.ridge_covariance = StaticBatch(self), RidgeCovariance(self)
         self.periods: Mapping[Symbol, float] = {}
         self.counted: frozenset[Symbol] = frozenset()
         if self.native:
@@ -116,8 +109,7 @@ class UpdateStep:
                 continue
             candidates += new
             rounds = max(rounds, count)
-        should_merge = partial(self.merge_criterion.should_merge, inputs, self.periods)
-        after, best = mixture.select(candidates, should_merge)
+        after, best = mixture.select(candidates, self, inputs)
         nis = np.array([c.nis[n] if c else 0.0 for n, c in enumerate(best)])
         dof = np.array([c.dof[n] if c else 0.0 for n, c in enumerate(best)])
         of_group = [(i, best[n]) for i, n in enumerate(self.layout.group_of) if reading.mask[i]]
@@ -129,7 +121,7 @@ class UpdateStep:
                 dof[self.layout.group_of[i]] += len(error)
         return StepResult(after, nis, dof, tuple(rejected), rounds)
 
-    def _solve(
+    def solve(
         self,
         belief: InformationState,
         reading: Measurements,
@@ -137,6 +129,7 @@ class UpdateStep:
         groups: list[int],
         loss: Loss = "gaussian",
     ) -> MapResult:
+        """Update some groups of one component."""
         if self.native is not None and self.native.is_ready:
             if (result := self.native.update(belief, reading, inputs, groups, loss)) is not None:
                 return result
@@ -151,7 +144,7 @@ class UpdateStep:
             count = mixture.alive.sum(axis=0)
             single = [number for number in groups if count[number] == 1]
         try:
-            result = self._solve(belief, reading, inputs, single)
+            result = self.solve(belief, reading, inputs, single)
         except KineverseError:
             if self.outliers is None:
                 raise
@@ -159,7 +152,7 @@ class UpdateStep:
         if self.outliers is None:
             unexplained = find_unexplained(result)
             if unexplained and not self.counted:
-                unexplained = self.stationary_points.unexplained(belief, result)
+                unexplained = self._find_unobserved(belief, result)
             settled = [n for n in single if n not in unexplained] if unexplained else single
         else:
             are_certain = self._are_inliers(belief, result, reading, self.outliers)
@@ -189,7 +182,7 @@ class UpdateStep:
         inputs: Array,
         groups: list[int],
     ) -> list[Candidate]:
-        starts = self.stationary_points.restart_states(old, result.belief, groups, inputs)
+        starts = restart_states(self, old, result.belief, groups, inputs)
         return [one for start in starts for one in self._restart_from(start, reading, inputs, groups)]
 
     def _try_other_turns(
@@ -229,10 +222,10 @@ class UpdateStep:
     ) -> list[Candidate]:
         try:
             if self.outliers is None:
-                result = self._solve(start, reading, inputs, groups)
+                result = self.solve(start, reading, inputs, groups)
             else:
-                robust = self._solve(start, reading, inputs, groups, "cauchy").prior
-                result = self._solve(robust, reading, inputs, groups, "mixture")
+                robust = self.solve(start, reading, inputs, groups, "cauchy").prior
+                result = self.solve(robust, reading, inputs, groups, "mixture")
             candidate = self._relinearised(start, result, reading, inputs, groups)
         except KineverseError:
             return []
@@ -283,7 +276,7 @@ class UpdateStep:
             self.velocity.predict(result, inputs, dt, speeds, noise)
             moments = [m for one in result.speeds if one for m in (one.mean, one.gain, one.covariance)]
             _require_finite(result.numbers, *moments)
-            result = self._constrained(result, inputs)
+            result = self.constrained(result, inputs)
             _require_finite(result.numbers)
             return result
         moving = self.process_model.find_moving_groups(speeds, noise)
@@ -298,9 +291,9 @@ class UpdateStep:
         if moved is None:
             moved = belief.copy()
             self.process_model.predict(moved, inputs, dt, speeds, noise)
-            moved = self._constrained(moved, inputs)
+            moved = self.constrained(moved, inputs)
         elif self.layout.limits:
-            moved = self._constrained(moved, inputs)
+            moved = self.constrained(moved, inputs)
         for number in noise_only:
             # A straight posterior is Gaussian; its prediction is exact.
             if self.ridge_covariance.is_straight(number, belief):
@@ -312,7 +305,7 @@ class UpdateStep:
         _require_finite(moved.numbers)
         return moved
 
-    def _constrained(self, belief: InformationState, inputs: Array) -> InformationState:
+    def constrained(self, belief: InformationState, inputs: Array) -> InformationState:
         """Return the same belief about the most probable point inside the limits."""
         inside = np.clip(belief.x, self.limits.lower, self.limits.upper)
         if (beyond := np.flatnonzero(inside != belief.x)).size:
@@ -327,7 +320,7 @@ class UpdateStep:
         elif not self.layout.limits:
             if float(belief.vector @ np.linalg.solve(belief.information, belief.vector)) < _SETTLED**2:
                 return belief
-        return self._solve(belief, self.reader.empty(), inputs, self._all_groups).belief
+        return self.solve(belief, self.reader.empty(), inputs, self._all_groups).belief
 
     def is_possible(self, number: int, belief: InformationState, inputs: Array) -> bool:
         """Return True if a group is inside its limits at a state and its model is finite there."""
@@ -393,15 +386,16 @@ class UpdateStep:
     ) -> tuple[list[Candidate], int]:
         """Return candidates for one component: without outliers, with outliers, and all outliers."""
         if self.outliers is None:
-            results = [self._solve(belief, reading, inputs, groups)]
+            results = [self.solve(belief, reading, inputs, groups)]
         else:
-            robust = self._solve(belief, reading, inputs, groups, "cauchy").prior
-            results = [self._solve(start, reading, inputs, groups, "mixture") for start in (belief, robust)]
+            robust = self.solve(belief, reading, inputs, groups, "cauchy").prior
+            results = [self.solve(start, reading, inputs, groups, "mixture") for start in (belief, robust)]
         candidates = [self._relinearised(belief, result, reading, inputs, groups) for result in results]
         rounds, result = max(result.rounds for result in results), results[-1]
         if is_best:
-            rejected = self._with_rejected(result, reading, groups)
-            unexplained = {*self.stationary_points.unexplained(belief, result), *rejected}
+            wrong = {*self._group_of[reading.mask & (result.weights < 0.5)].tolist()}
+            rejected = [n for n in groups if n in wrong]
+            unexplained = {*self._find_unobserved(belief, result), *rejected}
             if again := [n for n in groups if n in unexplained]:
                 candidates += self._restart(belief, result, reading, inputs, again)
             if self.counted:
@@ -416,9 +410,10 @@ class UpdateStep:
         candidates.append(Candidate(all_outliers, np.zeros(len(reading.mask)), none, none, groups))
         return candidates, rounds
 
-    def _with_rejected(self, result: MapResult, reading: Measurements, groups: list[int]) -> list[int]:
-        rejected = reading.mask & (result.weights < 0.5)
-        return [n for n in groups if rejected[list(self.layout.groups[n].observation_indices)].any()]
+    def _find_unobserved(self, before: InformationState, result: MapResult) -> list[int]:
+        """Return the groups whose residuals exceed the noise and that have unobservable directions."""
+        groups, is_in = find_unexplained(result), self.unobservable.is_in
+        return [n for n in groups if before.records[n] is not None or is_in(n, result.belief)]
 
 
 def _require_finite(*arrays: Array) -> None:
