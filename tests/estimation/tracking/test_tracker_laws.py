@@ -363,7 +363,9 @@ def test_compiled_and_numpy_agree_about_groups_with_several_active_bounds(seed):
             )
             before = f"{name} end"
             edit.add_frame(before, parent=f"{name} link", transform=kv.translation(*step))
-    a, b = kv.position("a"), kv.position("b")
+        a, b = kv.position("a"), kv.position("b")
+        edit.constrain("curved", 0, a**2 + b**2, 0.3)
+        edit.constrain("conditional", *kv.articulations.position_lock(a, open_if=b < 0.2, upper=0.45))
     observed = [
         ObservedPose("e end", covariance=0.01 * np.eye(6) + 0.005),
         kv.estimation.ObservedPosition("c end", (0.1, 0.2, 0.3)),
@@ -410,7 +412,7 @@ def test_solve_bounded_qp_equals_nonnegative_least_squares():
         inside = rows @ rng.standard_normal(n)
         low, high = inside - rng.uniform(0, 1, m), inside + rng.uniform(0, 1, m)
         low[rng.random(m) < 0.3] = -np.inf
-        x = solve_bounded_qp(np.linalg.inv(A), g, rows, low, high)
+        x = solve_bounded_qp(A, -g, rows, low, high)
         assert (rows @ x >= low - 1e-8).all()
         assert (rows @ x <= high + 1e-8).all()
         # Karush-Kuhn-Tucker: the gradient is a combination of active rows with the correct signs.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -24,8 +25,8 @@ from .observability import (
     StaticBatch,
     UnobservableDirections,
     find_unexplained,
-    move_origin,
     restart_states,
+    turned_states,
 )
 from .process_model import ConstantVelocity, ProcessModel, Speeds
 from .residuals import MeasurementReader, Measurements, Residuals
@@ -174,49 +175,6 @@ class UpdateStep:
         gained = result.belief.evidence - before.evidence
         return np.asarray((gained - as_outliers > PRUNING_LOG_RATIO) & (doubts == 0))
 
-    def _restart(
-        self,
-        old: InformationState,
-        result: MapResult,
-        reading: Measurements,
-        inputs: Array,
-        groups: list[int],
-    ) -> list[Candidate]:
-        starts = restart_states(self, old, result.belief, groups, inputs)
-        return [one for start in starts for one in self._restart_from(start, reading, inputs, groups)]
-
-    def _try_other_turns(
-        self,
-        old: InformationState,
-        result: MapResult,
-        reading: Measurements,
-        inputs: Array,
-        groups: list[int],
-    ) -> list[Candidate]:
-        """Return candidates on other turns of counted coordinates, such as a pinion on its rack."""
-        candidates: list[Candidate] = []
-        for x in self.counted:
-            i = self.layout.tangent_space.coordinates.index(x)
-            number = next(n for n, group in enumerate(self.layout.groups) if i in group.x)
-            group = self.layout.groups[number]
-            if number not in groups or group.by_speeds:
-                continue
-            place, off = result.belief.x.copy(), []
-            for turn in (0.0, math.tau):
-                place[i] = result.belief.x[i] + turn
-                out = self.residuals.evaluate(place, inputs)
-                errors = self.residuals.errors(out, reading, group.observation_indices)
-                off.append(np.concatenate([error for error, _ in errors.values()]))
-            change = off[1] - off[0]
-            turns = round(-float(off[0] @ change) / max(float(change @ change), np.finfo(float).tiny))
-            if turns:
-                place[i] = result.belief.x[i] + turns * math.tau
-                start = old.copy()
-                there = place[group.x]
-                move_origin(start, number, group, there, there - old.x[group.x], None)
-                candidates += self._restart_from(start, reading, inputs, [number])
-        return candidates
-
     def _restart_from(
         self, start: InformationState, reading: Measurements, inputs: Array, groups: list[int]
     ) -> list[Candidate]:
@@ -291,8 +249,6 @@ class UpdateStep:
         if moved is None:
             moved = belief.copy()
             self.process_model.predict(moved, inputs, dt, speeds, noise)
-            moved = self.constrained(moved, inputs)
-        elif self.layout.limits:
             moved = self.constrained(moved, inputs)
         for number in noise_only:
             # A straight posterior is Gaussian; its prediction is exact.
@@ -396,11 +352,13 @@ class UpdateStep:
             wrong = {*self._group_of[reading.mask & (result.weights < 0.5)].tolist()}
             rejected = [n for n in groups if n in wrong]
             unexplained = {*self._find_unobserved(belief, result), *rejected}
-            if again := [n for n in groups if n in unexplained]:
-                candidates += self._restart(belief, result, reading, inputs, again)
-            if self.counted:
-                turned = find_unexplained(result) if self.outliers is None else rejected
-                candidates += self._try_other_turns(belief, result, reading, inputs, turned)
+            again = [n for n in groups if n in unexplained]
+            starts = [(start, again) for start in restart_states(self, belief, result.belief, again, inputs)]
+            turned = find_unexplained(result) if self.outliers is None else rejected
+            starts += turned_states(self, belief, result.belief, reading, inputs, turned)
+            candidates += itertools.chain.from_iterable(
+                self._restart_from(start, reading, inputs, some) for start, some in starts
+            )
         if self.outliers is None:
             return candidates, rounds
         all_outliers, none = belief.copy(), np.zeros(len(self.layout.groups))

@@ -8,14 +8,13 @@ cost is the negative log density of the outlier mixture.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Literal, TypeAlias
 
 import numpy as np
 
 from kineverse.errors import InvalidValueError, ModelError
-from kineverse.estimation.linear_algebra import inverse_spd
 from kineverse.estimation.noise import Outliers, cauchy_weight
 from kineverse.lie import Array
 
@@ -59,18 +58,16 @@ class _Iterate:
 
     x: Array
     prior: QuadraticCost
-    posterior: QuadraticCost
-    cost: float  # of all residuals, whose squares are weighted in the posterior
+    posterior: QuadraticCost  # with the weighted squares of the residuals
+    excess: float  # cost of the residuals beyond; infinite where the model or its Jacobian is not finite
     rows: BoundRows  # bounds on steps
-    squares: Array  # of its measured residuals, and their weights
-    weights: Array
+    residuals: Mapping[int, tuple[float, float]]  # square and weight of each measured residual
 
     def is_better_than(self, other: _Iterate) -> bool:
-        if not math.isfinite(self.cost):
-            return False
         if other.rows.violation > _OUTSIDE and self.rows.violation < other.rows.violation / 2:
-            return True
-        return self.cost <= other.cost + 1e-10 * (1 + abs(other.cost))
+            return math.isfinite(self.excess)
+        cost = other.posterior.cost + other.excess
+        return self.posterior.cost + self.excess <= cost + 1e-10 * (1 + abs(cost))
 
 
 class MapSolver:
@@ -110,94 +107,72 @@ class MapSolver:
         most = 0
         for number in groups:
             group = layout.groups[number]
-            measured = [i for i in group.observation_indices if reading.mask[i]]
-            least, last, x, step, transport, rounds = self._iterate(number, belief, reading, inputs, loss)
-            posterior = last.posterior.transported(step, transport)
-            before = last.prior.transported(step, transport)
-            after.x[group.x] = prior.x[group.x] = x
-            after.set_group_cost(group.t, posterior)
-            prior.set_group_cost(group.t, before)
-            squares[measured], weights[measured] = last.squares, last.weights
+            last, least, rounds = self._iterate(number, belief, reading, inputs, loss)
+            after.x[group.x] = prior.x[group.x] = last.x
+            after.set_group_cost(group.t, last.posterior)
+            prior.set_group_cost(group.t, last.prior)
             # Least cost without limits. In the linear case this is the innovation squared in S⁻¹.
-            nis[number] = max(2 * posterior.minimum, 0.0)
-            dof[number] = sum(layout.observations[i].size for i in measured if weights[i] >= 0.5)
-            gained = (before.log_determinant - posterior.log_determinant) / 2
-            gained -= posterior.cost + last.cost - last.posterior.cost - least
-            after.evidence[number] += gained - float(reading.log_scale[measured].sum())
+            nis[number] = max(2 * last.posterior.minimum, 0.0)
+            gained = (last.prior.log_determinant - last.posterior.log_determinant) / 2
+            after.evidence[number] += gained - (last.posterior.cost + last.excess - least)
+            for i, (square, weight) in last.residuals.items():
+                squares[i], weights[i] = square, weight
+                dof[number] += layout.observations[i].size * (weight >= 0.5)
+                after.evidence[number] -= reading.log_scale[i]
             most = max(most, rounds)
         return MapResult(after, prior.numbers, nis, dof, most, squares, weights)
 
     def _iterate(
         self, number: int, belief: InformationState, reading: Measurements, inputs: Array, loss: Loss
-    ) -> tuple[float, _Iterate, Array, Array, Array | None, int]:
-        """Return the least cost of the prior inside the limits, and the end of the iteration.
-
-        That is the best iterate, the state after a last step from it, this step and its transport, and the
-        number of evaluations.
-        """
-        group, bounds = self.layout.groups[number], self.group_bounds[number]
+    ) -> tuple[_Iterate, float, int]:
+        """Return the last iterate, the least cost of the prior inside the limits, and the evaluations."""
+        group, bounds, place = self.layout.groups[number], self.group_bounds[number], belief.x.copy()
         names = ", ".join(map(str, group.coordinates))
-        best = self._linearise(
-            number, belief, belief.x[group.x], belief.group_cost(group.t), reading, inputs, loss
-        )
-        if not math.isfinite(best.cost):
+
+        def linearise(x: Array, prior: QuadraticCost) -> _Iterate:
+            place[group.x] = x
+            out = self._residuals.evaluate(place, inputs)
+            with np.errstate(invalid="ignore", over="ignore"):
+                measured = self._residuals.errors(out, reading, group.observation_indices)
+                squares = {i: float(e @ e) for i, (e, _) in measured.items()}
+            weighed = {i: self._weigh(i, square, reading, loss) for i, square in squares.items()}
+            residuals = {i: (square, weighed[i][0]) for i, square in squares.items()}
+            rows, cost = bounds.rows(x, out), prior.cost + sum(each for _, each in weighed.values())
+            if not (math.isfinite(cost) and all(np.isfinite(s).all() for _, s in measured.values())):
+                return _Iterate(x, prior, prior, math.inf, rows, residuals)
+            posterior = prior.with_measurements((e, s, weighed[i][0]) for i, (e, s) in measured.items())
+            return _Iterate(x, prior, posterior, cost - posterior.cost, rows, residuals)
+
+        best = linearise(belief.x[group.x], belief.group_cost(group.t))
+        if not math.isfinite(best.excess):
             self._residuals.check(self._residuals.evaluate(belief.x, inputs), group.observation_indices)
             raise InvalidValueError(
                 f"A measurement of {names} is too far away, or its covariance too small, for floating point."
             )
         # 0 if the limits contradict each other.
-        inside = solve_bounded_qp(inverse_spd(best.prior.matrix), -best.prior.vector, *best.rows)
+        inside = solve_bounded_qp(best.prior.matrix, best.prior.vector, *best.rows)
         least = 0.0 if inside is None else best.prior.transported(inside, None).cost
         damping = 0.0
         for rounds in range(1, _MOST_ROUNDS + 1):
-            matrix = best.posterior.matrix
-            if damping:
-                matrix = matrix + damping * np.diag(np.diag(matrix))
-            step = solve_bounded_qp(inverse_spd(matrix), -best.posterior.vector, *best.rows)
+            matrix = best.posterior.matrix + damping * np.diag(np.diag(best.posterior.matrix))
+            step = solve_bounded_qp(matrix, best.posterior.vector, *best.rows)
             if step is None:
                 raise ModelError(f"The limits of {names} leave no state between them.")
             turned = float(np.abs(step[group.rate_directions]).max(initial=0.0))
             if turned > np.pi:
                 step = step * (np.pi / turned)  # linearisation is useless beyond half a turn
             x, transport = self.process_model.retract(number, best.x, step, inputs)
-            x = bounds.clip(x)
+            x, prior = bounds.clip(x), best.prior.transported(step, transport)
             if float(step @ matrix @ step) <= _CONVERGED**2 or damping > _MOST_DAMPING:
-                return least, best, x, step, transport, rounds
+                posterior = best.posterior.transported(step, transport)
+                return replace(best, x=x, prior=prior, posterior=posterior), least, rounds
             if rounds < _MOST_ROUNDS:
-                prior = best.prior.transported(step, transport)
-                trial = self._linearise(number, belief, x, prior, reading, inputs, loss)
+                trial = linearise(x, prior)
                 if trial.is_better_than(best):
                     best, damping = trial, damping / 10 if damping > 1e-6 else 0.0
                 else:
                     damping = max(10 * damping, 1e-3)
-        return least, best, best.x, np.zeros(len(group.t)), None, _MOST_ROUNDS
-
-    def _linearise(
-        self,
-        number: int,
-        belief: InformationState,
-        x: Array,
-        prior: QuadraticCost,
-        reading: Measurements,
-        inputs: Array,
-        loss: Loss,
-    ) -> _Iterate:
-        """Linearise at a point; the cost is infinite where the model or its Jacobian is not finite."""
-        group, there = self.layout.groups[number], belief.x.copy()
-        there[group.x] = x
-        out = self._residuals.evaluate(there, inputs)
-        with np.errstate(invalid="ignore", over="ignore"):
-            measured = self._residuals.errors(out, reading, group.observation_indices)
-            squares = np.array([float(e @ e) for e, _ in measured.values()])
-        weighed = [self._weigh(i, s, reading, loss) for i, s in zip(measured, squares.tolist(), strict=True)]
-        weights, cost = [weight for weight, _ in weighed], prior.cost + sum(cost for _, cost in weighed)
-        if not (math.isfinite(cost) and all(np.isfinite(s).all() for _, s in measured.values())):
-            cost, posterior = math.inf, prior
-        else:
-            triples = ((e, s, w) for (e, s), w in zip(measured.values(), weights, strict=True))
-            posterior = prior.with_measurements(triples)
-        rows = self.group_bounds[number].rows(x, out)
-        return _Iterate(x, prior, posterior, cost, rows, squares, np.array(weights))
+        return best, least, _MOST_ROUNDS
 
     def _weigh(self, i: int, square: float, reading: Measurements, loss: Loss) -> tuple[float, float]:
         """Return the weight of a residual and its cost."""

@@ -15,11 +15,12 @@ import numpy as np
 
 from kineverse.compilation import CompiledFunction
 from kineverse.compilation.c_library import SourceLibrary, struct_fields
+from kineverse.estimation.pose_checks import RIGID
 from kineverse.lie import Array
 
 from .information_state import InformationState
 from .map_update import Loss, MapResult, MapSolver
-from .residuals import RIGID, Measurements
+from .residuals import Measurements
 from .state_space import Layout
 
 _MAX_UNKNOWNS, _MAX_MEASUREMENT_SIZE = 64, 64  # sizes of the arrays on the stack of the C code
@@ -62,7 +63,7 @@ class NativeMapSolver:
         )
         self._motions = [solver.process_model.flow(number) for number in range(count)]
         is_varying = [np.empty(0) if m is None else m.is_varying.reshape(-1) for m in self._motions]
-        self._size, self._is_linear = size, not solver.process_model.has_rates
+        self._size, self._is_linear = size, not (solver.process_model.has_rates or layout.limits)
         limits = [layout.limit_slices[k].start for group in groups for k in group.limits]
         indices: dict[str, Any] = {
             "is_pose": [one.is_pose for one in layout.observations],
@@ -181,7 +182,7 @@ class NativeMapSolver:
     def predict(
         self, belief: InformationState, displacement: Array, added_variance: Array
     ) -> InformationState | None:
-        """Predict a belief inside bounds of single coordinates; None unless these are the tangent."""
+        """Predict a belief inside its bounds; None for rates, curved limits, or on any difficulty."""
         if not self._is_linear:
             return None
         with self._lock:

@@ -17,6 +17,7 @@ Suboptimal state estimation for continuous-time nonlinear systems, 1968).
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
@@ -119,6 +120,38 @@ def restart_states(
             move_origin(beliefs[index], number, group, there, change, transport)
             index += 1
     return beliefs
+
+
+def turned_states(
+    step: UpdateStep,
+    before: InformationState,
+    after: InformationState,
+    reading: Measurements,
+    inputs: Array,
+    groups: Sequence[int],
+) -> list[tuple[InformationState, list[int]]]:
+    """Return prior beliefs on other turns of counted coordinates, as of a pinion, with their group."""
+    result = []
+    for x in step.counted:
+        i = step.layout.tangent_space.coordinates.index(x)
+        number = next(n for n, group in enumerate(step.layout.groups) if i in group.x)
+        group = step.layout.groups[number]
+        if number not in groups or group.by_speeds:
+            continue
+        place, errors = after.x.copy(), []
+        for turn in (0.0, math.tau):
+            place[i] = after.x[i] + turn
+            out = step.residuals.evaluate(place, inputs)
+            measured = step.residuals.errors(out, reading, group.observation_indices)
+            errors.append(np.concatenate([error for error, _ in measured.values()]))
+        change = errors[1] - errors[0]
+        turns = round(-float(errors[0] @ change) / max(float(change @ change), np.finfo(float).tiny))
+        if turns:
+            place[i] = after.x[i] + turns * math.tau
+            start, there = before.copy(), place[group.x]
+            move_origin(start, number, group, there, there - before.x[group.x], None)
+            result.append((start, [number]))
+    return result
 
 
 _LEAST_WEIGHT = 1e-3  # measurements with a smaller weight are ignored
