@@ -175,8 +175,6 @@ def log_principal_widths_gain(solution: Solution[FamilyMember], weight: float = 
     motion = solution.motion
     if not isinstance(motion, GroupMotion) or motion.joints == len(set(motion.kinds)):
         return 0.0
-    if motion.rows == 3 and motion.name == "spherical":
-        return 0.0  # errors of the parent's orientation move the position about the parent's origin
     known, parts = solver.evidence(solution, weight), []
     for kind in sorted(set(motion.kinds)):
         block = np.array(motion.kinds) == kind
@@ -189,7 +187,8 @@ def log_principal_widths_gain(solution: Solution[FamilyMember], weight: float = 
     # A common frame has the principal directions of translations, or of rotations if there are no others.
     (squares, directions), turn, log_directions = parts[0], np.eye(3), 0.0
     axes = [joint % 3 for joint in motion.parametrisation.joints[: len(squares)]]
-    turn[np.ix_(axes, axes)] = directions * np.linalg.det(directions)
+    turn[np.ix_(axes, axes)] = directions
+    turn[:, axes[0]] *= np.linalg.det(turn)
     for one, other in itertools.combinations(np.maximum(squares, 1e-12), 2):
         information = weight * len(solution.values) * (math.sqrt(one / other) - math.sqrt(other / one)) ** 2
         # Principal directions have no order, so each of their angles is within a quarter of a revolution.
