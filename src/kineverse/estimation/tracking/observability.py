@@ -329,7 +329,8 @@ class RidgeCovariance:
         assert record is not None
         bounds, inputs, measured = step.solver.group_bounds[number], record.inputs, list(record.means)
         here = step.residuals.evaluate(x, inputs)
-        reading = record.as_measurements(step)._replace(values=step.reader.as_values(here))
+        predicted = step.reader.as_reading(here, measured)
+        reading = record.as_measurements(step)._replace(values=predicted.values)
         slopes = {i: s for i, (_, s) in step.residuals.errors(here, reading, measured).items()}
 
         def back(along: Array) -> Array:
