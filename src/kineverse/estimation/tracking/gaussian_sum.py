@@ -122,6 +122,7 @@ class GaussianSum:
 # Candidates merge if their predictions differ by fewer deviations of the noise, and each coordinate of the
 # state by fewer of its own.
 _SAME_PREDICTION, _NEAR = 0.3, 3.0
+_EQUAL = 1e-3  # states that differ by fewer deviations predict the same
 
 
 def _are_one(
@@ -134,11 +135,13 @@ def _are_one(
         if x in step.periods:
             change[k] = math.remainder(change[k], step.periods[x])
     # Between both states, to first order.
-    between = np.linalg.pinv(step.process_model.basis(number, here, inputs)) @ change
-    if between @ other.information[group.block] @ between >= _NEAR**2 * len(between):
-        return False
-    predicted, empty = step.reader.as_values(step.residuals.evaluate(other.x, inputs)), step.reader.empty()
-    as_predicted = empty._replace(values=predicted, mask=~empty.mask)
-    out = step.residuals.evaluate(one.x, inputs)
-    errors = step.residuals.errors(out, as_predicted, group.observation_indices)
+    between = (
+        np.linalg.pinv(step.process_model.basis(number, here, inputs)) @ change if group.by_speeds else change
+    )
+    squared = float(between @ other.information[group.block] @ between)
+    if squared < _EQUAL**2 or squared >= _NEAR**2 * len(between):
+        return squared < _EQUAL**2
+    here, there = (step.residuals.evaluate(belief.x, inputs) for belief in (other, one))
+    reading = step.reader.as_reading(here, group.observation_indices)
+    errors = step.residuals.errors(there, reading, group.observation_indices)
     return all(float(e @ e) < _SAME_PREDICTION**2 for e, _ in errors.values())

@@ -16,7 +16,7 @@ from kineverse.lie import Array
 from kineverse.symbols import Symbol
 
 from .bounds import StateBounds
-from .gaussian_sum import PRUNING_LOG_RATIO, Candidate, GaussianSum
+from .gaussian_sum import Candidate, GaussianSum
 from .information_state import InformationState
 from .map_update import Loss, MapResult, MapSolver
 from .native import NativeMapSolver, native_library
@@ -45,7 +45,8 @@ class StepResult:
 
 
 _OUTSIDE = 1e-9
-_CERTAIN = 1 - 1e-6  # above this inlier probability a measurement is taken as an inlier
+# With these odds a measurement is certainly an inlier, and a group has no other explanation.
+_LOG_CERTAIN = math.log(1000.0)
 _SETTLED = 1e-5  # a belief closer to its mean, in deviations, is about its mean, as after an update
 
 
@@ -67,6 +68,8 @@ class UpdateStep:
         self.native = NativeMapSolver(self.solver, self.function) if suits else None
         self.unobservable = UnobservableDirections(layout)
         self.static_batch, self.ridge_covariance = StaticBatch(self), RidgeCovariance(self)
+        # The cost of such a group is convex: a restart ends where the update did.
+        self._is_affine = [layout.is_affine(number) for number in self._all_groups]
         self.periods: Mapping[Symbol, float] = {}
         self.counted: frozenset[Symbol] = frozenset()
         if self.native:
@@ -165,15 +168,14 @@ class UpdateStep:
     ) -> npt.NDArray[np.bool_]:
         """Return True for each group whose measurements are certain inliers, and add this to its evidence."""
         log_inlier, log_outlier = math.log(1 - outliers.fraction), self.solver.outlier_densities(reading)
-        odds = np.minimum(log_outlier + result.squares / 2 - log_inlier, 100.0)
-        is_doubtful = 1 / (1 + np.exp(odds)) <= _CERTAIN
+        is_doubtful = log_inlier - result.squares / 2 - log_outlier < _LOG_CERTAIN
         as_inliers, as_outliers, doubts = (
             np.bincount(self._group_of, np.where(reading.mask, each, 0.0), len(self.layout.groups))
             for each in (log_inlier, log_outlier - reading.log_scale, is_doubtful)
         )
         result.belief.evidence += as_inliers
         gained = result.belief.evidence - before.evidence
-        return np.asarray((gained - as_outliers > PRUNING_LOG_RATIO) & (doubts == 0))
+        return np.asarray((gained - as_outliers > _LOG_CERTAIN) & (doubts == 0))
 
     def _restart_from(
         self, start: InformationState, reading: Measurements, inputs: Array, groups: list[int]
@@ -370,8 +372,9 @@ class UpdateStep:
 
     def _find_unobserved(self, before: InformationState, result: MapResult) -> list[int]:
         """Return the groups whose residuals exceed the noise and that have unobservable directions."""
-        groups, is_in = find_unexplained(result), self.unobservable.is_in
-        return [n for n in groups if before.records[n] is not None or is_in(n, result.belief)]
+        curved = [n for n in find_unexplained(result) if not self._is_affine[n]]
+        records, is_in = before.records, self.unobservable.is_in
+        return [n for n in curved if records[n] is not None or is_in(n, result.belief)]
 
 
 def _require_finite(*arrays: Array) -> None:

@@ -212,6 +212,8 @@ class StaticBatch:
 
     def __init__(self, step: UpdateStep) -> None:
         self._step, self._layout = step, step.layout
+        # In a group with one direction, linearisation at several estimates adds no false information.
+        self._groups = {number for number, group in enumerate(step.layout.groups) if len(group.t) > 1}
 
     def relinearise(
         self,
@@ -223,10 +225,9 @@ class StaticBatch:
     ) -> None:
         """Recompute an update from all stored measurements where a group has unobservable directions."""
         after, unobservable = result.belief, self._step.unobservable
-        for number in groups:
+        for number in self._groups.intersection(groups):
             group, old = self._layout.groups[number], before.records[number]
-            # In a group with one direction, linearisation at several estimates adds no false information.
-            if len(group.t) == 1 or (old is None and not unobservable.is_in(number, after)):
+            if old is None and not unobservable.is_in(number, after):
                 continue
             new = {
                 i: self._mean_measurement(i, reading, float(result.weights[i]))
@@ -328,7 +329,8 @@ class RidgeCovariance:
         assert record is not None
         bounds, inputs, measured = step.solver.group_bounds[number], record.inputs, list(record.means)
         here = step.residuals.evaluate(x, inputs)
-        reading = record.as_measurements(step)._replace(values=step.reader.as_values(here))
+        predicted = step.reader.as_reading(here, measured)
+        reading = record.as_measurements(step)._replace(values=predicted.values)
         slopes = {i: s for i, (_, s) in step.residuals.errors(here, reading, measured).items()}
 
         def back(along: Array) -> Array:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -44,15 +44,16 @@ class MeasurementReader:
         """Return a reading in which every observation is missing."""
         return Measurements(np.zeros(self._size), ~self._all, self._whitening, self._log_scale)
 
-    def as_values(self, predicted: Array) -> Array:
-        """Return predicted values in the layout of a reading."""
-        values = np.zeros(self._size)
-        for i, one in enumerate(self._layout.observations):
+    def as_reading(self, predicted: Array, indices: Iterable[int]) -> Measurements:
+        """Return predicted values of some observations as a reading with their usual covariances."""
+        reading = self.empty()
+        for i in indices:
             value = predicted[self._layout.value_slices[i]]
-            if one.is_pose:
+            if self._layout.observations[i].is_pose:
                 value = transform(value[:9].reshape(3, 3), value[9:]).reshape(-1)
-            values[self._layout.measurement_slices[i]] = value
-        return values
+            reading.values[self._layout.measurement_slices[i]] = value
+            reading.mask[i] = True
+        return reading
 
     def read(self, measurements: Mapping[str, Any]) -> Measurements:
         """Convert measurements by name, without :meth:`check_poses`; absent names are missing."""
