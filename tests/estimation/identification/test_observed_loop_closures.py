@@ -173,7 +173,7 @@ def test_a_slider_crank_is_closed() -> None:
 
 
 def test_a_loop_can_be_closed_at_each_of_its_joints() -> None:
-    """Here it is a slider, which holds other components than a hinge, in axes that are turned to suit."""
+    """Here it is a slider, which holds other components than a hinge."""
     values = np.random.default_rng(1).uniform(-1.2, 1.2, (40, 1))
     poses = data(slider_crank(), ["crank", "rod", "slider"], values, 2)
     known = {"world": exact_track(40), **check_tracks(poses, NOISE)}
@@ -252,7 +252,7 @@ def test_coordinates_of_linked_loops_are_resolved() -> None:
         )
 
     def closed(names: str, dependent: str, some: Array) -> ClosureEquations:
-        return ClosureEquations(ring(names, some), np.eye(3), [0], [*names], [dependent], some)
+        return ClosureEquations(ring(names, some), [0], [*names], [dependent], some[0], some)
 
     # Half of it was observed only at some of the times, and another loop shares no coordinate.
     loops = [closed("abc", "b", times), closed("cda", "c", times[2:]), closed("xy", "x", times[:1])]
@@ -265,7 +265,7 @@ def test_coordinates_of_linked_loops_are_resolved() -> None:
         rows = {x: np.zeros(4) for x in "bc"}
         for each, x in zip(loops, "bc", strict=False):
             at = np.searchsorted(each.times, time)
-            rows[x][["abcd".index(y) for y in each.ring.names]] = each.ring.equations(np.eye(3))[at, 0]
+            rows[x][["abcd".index(y) for y in each.ring.names]] = each.ring.equations()[at, 0]
         a = np.array([*rows.values()])
         speeds |= dict(
             zip("bc", np.linalg.solve(a[:, 1:3], -a[:, [0, 3]] @ [speeds["a"], speeds["d"]]), strict=True)

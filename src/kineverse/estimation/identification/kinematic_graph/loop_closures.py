@@ -15,7 +15,7 @@ import numpy.typing as npt
 from kineverse.estimation.identification.families import FamilyMotion, GroupMotion
 from kineverse.estimation.identification.joint_operations import family_coordinates, rigid_pose
 from kineverse.estimation.identification.result import Fit
-from kineverse.lie import Array, inverse, skew, transform
+from kineverse.lie import Array, inverse, skew
 from kineverse.loops import CloseLoop
 from kineverse.loops.equations import AXES
 from kineverse.model.basic_operations import AddFrame
@@ -40,8 +40,6 @@ CONSTRAINED_COMPONENTS: Mapping[str, tuple[int, ...]] = {
     "planar": (_Z, _RX, _RY),
 }
 """Components of the pin in the seat that each joint constrains: x, y, z and the rotations about them."""
-
-_ABOUT_Z = ("prismatic", "revolute", "cylindrical", "planar")  # families whose seat may be rotated about z
 
 
 class Chain(NamedTuple):
@@ -150,11 +148,13 @@ class Ring:
     times: Times
     twists: Array  # (N, 6, n)
 
-    def equations(self, seat_R_new: Array, twists: Array | None = None) -> Array:
-        """Return constrained twists in new axes, with translations divided by the lever, (N, m, n)."""
+    def equations(self, twists: Array | None = None) -> Array:
+        """Return constrained twists, with translations divided by the lever, (N, m, n)."""
         twists = self.twists if twists is None else twists
-        v, w = seat_R_new.T @ twists[:, :3] / _lever(twists), seat_R_new.T @ twists[:, 3:]
-        return np.concatenate([v, w], axis=1)[:, CONSTRAINED_COMPONENTS[self.family]]
+        v, w = (float(np.sum(part**2)) for part in (twists[:, :3], twists[:, 3:]))
+        lever = math.sqrt(v / w) if v and w else 1.0  # makes metres and radians comparable
+        scaled = np.concatenate([twists[:, :3] / lever, twists[:, 3:]], axis=1)
+        return scaled[:, CONSTRAINED_COMPONENTS[self.family]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,10 +162,10 @@ class ClosureEquations:
     """Equations of a closed loop: linear combinations of the speeds of its coordinates are zero."""
 
     ring: Ring
-    axes: Array  # of the seat
     rows: list[int]  # of the constrained components
     names: list[str]  # of the coordinates that were independent before
     dependent: list[str]
+    home: np.int_  # time at which the dependent coordinates are determined best
     times: Times
 
 
@@ -186,7 +186,7 @@ def close_loops(
     observed = {}
     for joint in joints:
         for k, x in enumerate(_coordinates(joint.result.best, joint.child) or ()):
-            observed[x] = joint.times, joint.result.best.joint_values[:, k]
+            observed[x] = dict(zip(joint.times, joint.result.best.joint_values[:, k].tolist(), strict=True))
     closed = []
     for loop, ring in sorted(selected, key=lambda pair: len(pair[0].chain)):
         leading = {x for each in closed for x in each.names} - {x for each in closed for x in each.dependent}
@@ -195,16 +195,16 @@ def close_loops(
             yield loop, None
             continue
         closed.append(plan)
-        joint, turn = loop.joint, transform(plan.axes, np.zeros(3))
+        joint = loop.joint
         closure = LoopClosure(
             f"{joint.child}/{joint.parent}",
             joint.parent,
-            ring.seat @ turn,
+            ring.seat,
             joint.child,
-            ring.pin @ turn,
+            ring.pin,
             mask=tuple(AXES[CONSTRAINED_COMPONENTS[ring.family][k]] for k in plan.rows),
             dependent=tuple(plan.dependent),
-            home=_find_home(observed, plan),
+            home=tuple((x, observed[x][plan.home]) for x in plan.names),
         )
         yield loop, closure
 
@@ -214,9 +214,8 @@ def _plan(
 ) -> ClosureEquations | None:
     """Return the equations of a loop; None if it removes no mobility or has no possible dependent."""
     names, times, twists = resolve(ring, closed)
-    axes = _align_axes(twists, ring.family in _ABOUT_Z)
-    equations, whole = ring.equations(axes, twists), ring.equations(axes)
-    largest = np.median(np.linalg.svd(whole, compute_uv=False)[:, 0])
+    equations = ring.equations(twists)
+    largest = np.median(np.linalg.svd(ring.equations(), compute_uv=False)[:, 0])
     values = np.linalg.svd(equations, compute_uv=False)
     # An observed loop has at least one degree of freedom.
     count = min(int(np.median(np.sum(values > _RANK_TOLERANCE * largest, axis=1))), len(names) - 1)
@@ -224,7 +223,8 @@ def _plan(
     if not 0 < count <= len(eligible):
         return None
     rows, columns = _choose_equations(equations, count, eligible)
-    return ClosureEquations(ring, axes, rows, names, [names[k] for k in columns], times)
+    home = times[np.argmax(_smallest_singular_values(equations[:, rows][:, :, columns]))]
+    return ClosureEquations(ring, rows, names, [names[k] for k in columns], home, times)
 
 
 def resolve(ring: Ring, closed: Sequence[ClosureEquations]) -> tuple[list[str], Times, Array]:
@@ -249,7 +249,7 @@ def resolve(ring: Ring, closed: Sequence[ClosureEquations]) -> tuple[list[str], 
     follows = np.array([any(x in each.dependent for each in linked) for x in names])
     moves = np.isin(names, ring.names) & ~follows
     if linked:
-        rows = [spread(each.ring, each.ring.equations(each.axes)[:, each.rows]) for each in linked]
+        rows = [spread(each.ring, each.ring.equations()[:, each.rows]) for each in linked]
         a = np.concatenate(rows, axis=1)
         slopes = -np.linalg.solve(a[:, :, follows], a[:, :, ~follows])
         of_ring = np.isin(np.array(names)[follows], ring.names)
@@ -287,48 +287,15 @@ def _build_ring(loop: ObservedLoop) -> Ring | None:
     return Ring(seat, pin, fit.family, tuple(names), chain.times, np.concatenate(twists, axis=1))
 
 
-def _align_axes(twists: Array, about_z: bool) -> Array:
-    """Return axes of the seat that are aligned with the plane of a planar linkage."""
-    v, w = (np.concatenate([*part.transpose(0, 2, 1)]) for part in (twists[:, :3], twists[:, 3:]))
-    if about_z:
-        # In a plane, ω and z x v are along its normal.
-        normal = np.concatenate([_lever(twists) * w[:, :2], v[:, 1::-1] * (-1.0, 1.0)])
-        x = np.linalg.eigh(normal.T @ normal)[1][:, 1]
-        return np.array([[x[0], -x[1], 0.0], [x[1], x[0], 0.0], [0.0, 0.0, 1.0]])
-    axes: Array = np.linalg.eigh(v.T @ v)[1]
-    axes[:, 2] *= np.linalg.det(axes)
-    return axes
-
-
-def _lever(twists: Array) -> float:
-    """Return the lever that makes radians and metres comparable [m]."""
-    v, w = (float(np.sum(part**2)) for part in (twists[:, :3], twists[:, 3:]))
-    return math.sqrt(v / w) if v and w else 1.0
-
-
 def _choose_equations(equations: Array, count: int, eligible: Sequence[int]) -> tuple[list[int], list[int]]:
-    """Return the rows and the dependent columns with the best conditioning in the worst configuration."""
-
-    def conditioning(square: Array) -> float:
-        return float(np.linalg.svd(square, compute_uv=False)[:, -1].min())
-
+    """Return the rows and the dependent columns that are determined best in the worst configuration."""
     each = combinations(range(equations.shape[1]), count)
-    rows = max(each, key=lambda some: conditioning(equations[:, some]))
+    rows = max(each, key=lambda some: _smallest_singular_values(equations[:, some]).min())
     chosen = equations[:, rows]
-    columns = max(combinations(eligible, count), key=lambda some: conditioning(chosen[:, :, some]))
+    each = combinations(eligible, count)
+    columns = max(each, key=lambda some: _smallest_singular_values(chosen[:, :, some]).min())
     return list(rows), list(columns)
 
 
-def _find_home(
-    observed: Mapping[str, tuple[Times, Array]], plan: ClosureEquations
-) -> tuple[tuple[str, float], ...]:
-    """Return the observed configuration in which independent coordinates are nearest to mid-range."""
-    values = {}
-    off = np.zeros(len(plan.times))
-    for x in plan.names:
-        when, every = observed[x]
-        values[x] = every[np.searchsorted(when, plan.times)]
-        if x not in plan.dependent:
-            middle, range_ = 0.5 * (every.min() + every.max()), np.ptp(every) or 1.0
-            off += ((values[x] - middle) / range_) ** 2
-    return tuple((x, float(every[np.argmin(off)])) for x, every in values.items())
+def _smallest_singular_values(matrices: Array) -> Array:
+    return np.asarray(np.linalg.svd(matrices, compute_uv=False)[:, -1])
