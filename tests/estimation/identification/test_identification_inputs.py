@@ -38,6 +38,8 @@ def with_entry(poses: np.ndarray, value: float) -> np.ndarray:
         (SEEN.parent, SEEN.child, 0 * NOISE, "not positive definite"),
         (SEEN.parent, SEEN.child, NOISE + np.eye(6, k=1), "not symmetric"),
         (SEEN.parent, SEEN.child, NOISE[:4, :4], "shape"),
+        (SEEN.parent, SEEN.child, 0.01, "pair of standard deviations"),
+        (SEEN.parent, SEEN.child, (0.01, -0.02), "positive and finite"),
         (SEEN.parent, "poses", NOISE, "no array of numbers"),
         (SEEN.parent, SEEN.child + 0j, NOISE, "no array of numbers"),
         (
@@ -54,6 +56,13 @@ def test_identify_refuses_invalid_poses(
 ) -> None:
     with pytest.raises(kv.KineverseError, match=message):
         identify(parent, child, noise=noise)
+
+
+def test_identify_takes_a_covariance_in_short_forms() -> None:
+    for child in (SEEN.child, SEEN.child[:, :3, 3]):
+        expected = identify(SEEN.parent, child, noise=NOISE)
+        for noise in ((0.01, 0.02), np.diag(NOISE), np.tile(NOISE, (6, 1, 1))):
+            assert identify(SEEN.parent, child, noise=noise).probabilities == expected.probabilities
 
 
 def test_identify_refuses_invalid_covariances_and_families() -> None:
@@ -136,7 +145,7 @@ def test_repeated_observations_count_once_with_their_correlation_time(stated: bo
         assert five.probabilities[name] == pytest.approx(probability, rel=0.1, abs=1e-6)
     np.testing.assert_allclose(five.best.covariance, once.best.covariance, rtol=0.05, atol=1e-9)
     np.testing.assert_allclose(
-        5.0 * sure.best.deviation("axis.x") ** 2, once.best.deviation("axis.x") ** 2, rtol=0.1
+        5.0 * sure["revolute"].deviation("axis.x") ** 2, once.best.deviation("axis.x") ** 2, rtol=0.1
     )
     for wrong in (0.5, np.nan, np.inf):
         with pytest.raises(kv.errors.InvalidValueError, match="at least 1"):

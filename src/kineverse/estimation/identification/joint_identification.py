@@ -57,13 +57,14 @@ def identify(
     child_poses
         Poses of the child in the same frame, (N, 4, 4), or only its positions, (N, 3) [m].
     parent_covariance, child_covariance
-        Covariances of their errors, one (6, 6) or one for each pose (N, 6, 6), see
-        :mod:`kineverse.estimation.noise`. For positions (3, 3) or (N, 3, 3).
+        Covariances of their errors: one for each pose (N, 6, 6), or a common one (6, 6), also as its diagonal
+        (6,) of variances, or as a pair (position, orientation) of standard deviations [m] and [rad], see
+        :mod:`kineverse.estimation.noise`. For positions (N, 3, 3), (3, 3), (3,) or a pair.
     families
         Families to compare; None for all of :data:`WEIGHTS`. A mapping also assigns prior weights.
     noise
-        Default covariance of both parts. Without any covariance, the sizes of position and orientation noise
-        are unknown and integrated out, see :mod:`.noise_estimation`.
+        Default covariance of both parts, such as ``(0.005, 0.02)``. Without any covariance, the sizes of
+        position and orientation noise are unknown and integrated out, see :mod:`.noise_estimation`.
     outliers
         Outlier model, or True for the default :class:`.Outliers`. Fewer than half of the observations may be
         outliers.

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import functools
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -13,11 +11,9 @@ import numpy as np
 import numpy.typing as npt
 
 from kineverse.errors import InvalidValueError, ShapeError
+from kineverse.estimation.pose_checks import as_numbers, check_covariances, check_finite, check_rigid
 from kineverse.lie import Array, inverse, translation
 
-_RIGID = 1e-4
-# Largest number and smallest standard deviation that double precision can handle.
-_LARGEST, _SMALLEST = 1e9, 1e-7
 _THIN = 4.0  # factor between successive levels of the continuation
 
 
@@ -90,7 +86,7 @@ def check_observations(
     fewest: int = 2,
 ) -> Observations:
     """Check poses and covariances and return them as observations."""
-    b = _numbers(child, "The poses of the child")
+    b = as_numbers(child, "The poses of the child")
     positions = b.ndim == 2 and b.shape[1:] == (3,)
     if not positions and b.shape[1:] != (4, 4):
         raise ShapeError(
@@ -101,14 +97,14 @@ def check_observations(
             f"There {'is one pose' if len(b) else 'are no poses'} of the child. A motion takes at least two."
         )
     if positions:
-        _check_finite(b, "child")
+        check_finite(b, "child")
         b = translation(b)
     else:
         check_rigid(b, "child")
     if parent is None:
         a = np.tile(np.eye(4), (len(b), 1, 1))
     else:
-        a = _numbers(parent, "The poses of the parent")
+        a = as_numbers(parent, "The poses of the parent")
         if a.shape == (4, 4):
             a = np.tile(a, (len(b), 1, 1))
         if a.shape[1:] != (4, 4):
@@ -120,99 +116,14 @@ def check_observations(
         check_rigid(a, "parent")
     of_parent = None
     if parent is not None and parent_covariance is not None:
-        of_parent = covariances(parent_covariance, len(b), 6, "parent")
-    of_child = covariances(child_covariance, len(b), 3 if positions else 6, "child")
+        of_parent = check_covariances(parent_covariance, len(b), 6, "parent")
+    of_child = check_covariances(child_covariance, len(b), 3 if positions else 6, "child")
     return Observations(np.ascontiguousarray(a), np.ascontiguousarray(b), of_parent, of_child)
 
 
-def check_rigid(poses: Array, part: str) -> None:
-    """Check that matrices (N, 4, 4) are rigid transforms."""
-    _check_finite(poses.reshape(len(poses), -1), part)
-    rotations = poses[:, :3, :3]
-    off = np.abs(np.swapaxes(rotations, 1, 2) @ rotations - np.eye(3)).max(axis=(1, 2))
-    last = np.abs(poses[:, 3] - (0.0, 0.0, 0.0, 1.0)).max(axis=1)
-    mirrored = np.linalg.det(rotations) < 0.0
-    wrong = np.flatnonzero((off > _RIGID) | (last > _RIGID) | mirrored)
-    if len(wrong):
-        k = int(wrong[0])
-        how = "mirrors" if mirrored[k] else f"is off by {max(off[k], last[k]):.2g}"
-        raise InvalidValueError(
-            f"Pose {k} of the {part} is no rigid transform: its matrix {how}. "
-            "Quaternions have to be of unit length before they become matrices."
-        )
-
-
-def covariances(common_or_each: npt.ArrayLike, count: int, rows: int, part: str) -> Array:
-    """Return covariances (N, m, m) from a common one or from one for each pose, of poses or of positions."""
-    matrices = _numbers(common_or_each, f"The covariance of the {part}")
-    if rows == 3 and matrices.shape[-2:] == (6, 6):
-        matrices = matrices[..., :3, :3]
-    if matrices.shape not in ((rows, rows), (count, rows, rows)):
-        raise ShapeError(
-            f"The covariance of the {part} has shape ({rows}, {rows}), or ({count}, {rows}, {rows}) with one "
-            f"for each pose, not {matrices.shape}."
-        )
-    if matrices.ndim == 2:
-        _check_one_covariance(matrices.tobytes(), rows, part)
-    else:
-        _check_covariances(matrices, part)
-    return np.ascontiguousarray(np.broadcast_to(matrices, (count, rows, rows)))
-
-
-@functools.lru_cache(maxsize=64)
-def _check_one_covariance(numbers: bytes, rows: int, part: str) -> None:
-    """Check a common covariance. The result is cached, because callers repeat the same one."""
-    _check_covariances(np.frombuffer(numbers).reshape(1, rows, rows), part)
-
-
-def _check_covariances(each: Array, part: str) -> None:
-    _check_finite(each.reshape(len(each), -1), part, "Covariance")
-    scale = np.sqrt(np.abs(np.einsum("nii->ni", each)))
-    scale[scale == 0.0] = 1.0
-    relative = each / (scale[:, :, None] * scale[:, None, :])
-    symmetric = np.abs(relative - np.swapaxes(relative, 1, 2)).max(axis=(1, 2)) < 1e-8
-    wrong = np.flatnonzero(~symmetric | (np.linalg.eigvalsh(relative)[:, 0] < 1e-12))
-    if len(wrong):
-        k = int(wrong[0])
-        how = "positive definite" if symmetric[k] else "symmetric"
-        raise InvalidValueError(
-            f"The covariance of the {part} is not {how} (at pose {k}). "
-            "kv.estimation.pose_covariance(position, orientation) makes one of standard deviations."
-        )
-    least = float(np.sqrt(np.linalg.eigvalsh(each)[:, 0].min(initial=math.inf)))
-    if least < _SMALLEST:
-        raise InvalidValueError(
-            f"The covariance of the {part} has a standard deviation of {least:.2g} (metres or radians). "
-            f"Below {_SMALLEST:.0g} it is lost in rounding."
-        )
-
-
-def _numbers(values: npt.ArrayLike, label: str) -> Array:
-    try:
-        if np.iscomplexobj(values):
-            raise TypeError
-        return np.asarray(values, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise ShapeError(f"{label} are no array of numbers.") from None
-
-
-def _check_finite(rows: Array, part: str, label: str = "Pose") -> None:
-    largest = np.abs(rows).max(axis=1, initial=0.0)
-    wrong = np.flatnonzero(~(largest <= _LARGEST))
-    if not len(wrong):
-        return
-    k, entry = int(wrong[0]), float(largest[wrong[0]])
-    if not math.isfinite(entry):
-        raise InvalidValueError(f"{label} {k} of the {part} is not finite. Leave out what was not observed.")
-    raise InvalidValueError(
-        f"{label} {k} of the {part} has a number of {entry:.2g}. None is expected above {_LARGEST:.0g}: "
-        "lengths are in metres, angles in radians."
-    )
-
-
 PosesLike: TypeAlias = "npt.ArrayLike | tuple[npt.ArrayLike, npt.ArrayLike]"
-"""Poses (N, 4, 4), or a pair of poses and covariance: (6, 6), or (N, 6, 6) with one for each pose. Where
-points are accepted, positions (N, 3) with (3, 3) or (N, 3, 3)."""
+"""Poses (N, 4, 4), or a pair of poses and covariance: a common one, see :mod:`.pose_checks`, or (N, 6, 6) of
+each pose. Where points are accepted, positions (N, 3)."""
 
 
 @dataclass(frozen=True)
@@ -249,7 +160,7 @@ def _track(name: str, observed: Any, noise: npt.ArrayLike | None, points: bool) 
     covariance = noise
     if isinstance(observed, tuple) and len(observed) == 2:
         observed, covariance = observed
-    poses = _numbers(observed, f"The poses of '{name}'").copy()
+    poses = as_numbers(observed, f"The poses of '{name}'").copy()
     is_point = points and poses.ndim == 2 and poses.shape[1] == 3
     if is_point:
         is_missing = np.isnan(poses).all(axis=1)
@@ -272,7 +183,7 @@ def _track(name: str, observed: Any, noise: npt.ArrayLike | None, points: bool) 
     spread = np.array(covariance, dtype=np.float64)
     if spread.ndim == 3 and len(spread) == len(mask):
         spread[~mask] = np.eye(spread.shape[-1])
-    return PoseTrack(poses, covariances(spread, len(poses), rows, f"frame '{name}'"), mask)
+    return PoseTrack(poses, check_covariances(spread, len(poses), rows, f"frame '{name}'"), mask)
 
 
 def exact_track(count: int) -> PoseTrack:
