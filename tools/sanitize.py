@@ -123,7 +123,7 @@ def run_short() -> None:
     assert path, path.why
     assert path.clearance() > 0.0
 
-    tracker = kv.estimation.Tracker(model, ["hand"], start={"x": 0.1, "y": 0.1})
+    tracker = kv.estimation.Tracker(model, ["hand"], start={"x": 0.1, "y": 0.1}, outliers=True)
     tracker.wait()
     for _ in range(3):
         tracker.update({"hand": np.array(kv.translation(0.2, 0.1, 0)())})

@@ -218,6 +218,33 @@ def test_fit_notes_options_without_effect(tmp_path, capsys):
     assert "columns that mean nothing here: force" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("head", "scale", "order", "note"),
+    [
+        ("time,x,y,z,roll,pitch,yaw", 1.0, "deg", "assumed: angles in deg"),
+        ("time,x,y,z,roll,pitch,yaw", 1000.0, "deg", "assumed: lengths in mm; angles in deg"),
+        ("", 1.0, "wxyz", "assumed: columns time,x,y,z,qw,qx,qy,qz"),
+        ("time,pose.position.x,pose.position.y,pose.position.z,pose.orientation.x,pose.orientation.y,"
+         "pose.orientation.z,pose.orientation.w", 1.0, "xyzw", ""),
+    ],
+)  # fmt: skip
+def test_fit_says_what_it_assumes(head, scale, order, note, tmp_path, capsys):
+    seen = noisy(hinge(np.linspace(0.0, 1.2, 30)), np.random.default_rng(1))
+    rotations = Rotation.from_matrix(seen[:, :3, :3])
+    w_first = np.roll(rotations.as_quat(), 1, axis=1)
+    numbers = {"deg": rotations.as_euler("xyz", degrees=True), "xyzw": rotations.as_quat(), "wxyz": w_first}
+    table = np.column_stack([0.1 * np.arange(30), scale * seen[:, :3, 3], numbers[order]])
+    np.savetxt(tmp_path / "door.csv", table, header=head, comments="", delimiter=",")
+    assert main(["fit", str(tmp_path / "door.csv"), *TWO, "--noise", "2mm,0.5deg", "--json"]) == 0
+    printed = capsys.readouterr()
+    assert note in printed.err
+    found = json.loads(printed.out)
+    assert found["family"] == "revolute"
+    assert "; ".join(found["assumptions"]) == note.removeprefix("assumed: ")
+    point = np.array(found["fits"][0]["parameters"]["point"])
+    assert np.linalg.norm(np.cross(point - POINT, AXIS)) < 0.01
+
+
 def test_thin_reduces_the_number_of_poses(door, capsys):
     assert answer([door, *DOOR, *TWO, "--noise", "2mm,0.5deg", "--thin", "10"], capsys)["count"] == 10
 
@@ -227,13 +254,20 @@ def test_thin_reduces_the_number_of_poses(door, capsys):
     [
         ("", [], "the file is empty"),
         ("0 0 0\n", [], "one pose"),
-        ("0 0 0\n0 nan 0\n", [], "line 2: y is 'nan'"),
+        ("0 0 0\n0 nan 0\n", [], "line 2: y is missing"),
+        ("pose.orientation.x,pose.orientation.y,pose.orientation.z\n0,0,1\n", [], "no column qw"),
+        ("0 0 0\n0 40 0\n", [], "Say --units m or --units mm"),
+        ("0 0 0\n0 40 0\n", ["--units", "inch"], "'inch' is no unit"),
         ("1 2 3\n1 2 3\n1 2 3\n", [], "All 3 poses are the same in every digit"),
         ("0 0 0 0 0 0 2\n", [], "line 1: the quaternion has the length 2, which is off by 1"),
         ("0 0 0\n0 0 1\n", ["--noise", "3deg"], "write two positive numbers"),
         ("0 0 0\n0 0 1\n", ["--noise", "3mm,2cm"], "write two positive numbers"),
         ("0 0 0\n0 0 1\n", ["--noise", "0"], "write two positive numbers"),
-        ("0 0 0 0 0 0 1\n0 0 1 0 0 0 1\n", ["--noise", "3mm"], "poses has two values"),
+        (
+            "0 0 0 0 0 0 1\n0 0 1 0 0 0 1\n",
+            ["--noise", "3mm", "--columns", "x,y,z,qx,qy,qz,qw"],
+            "poses has two values",
+        ),
         ("0 0 0\n0 0 1\n", ["--families", "hinge"], "There is no family 'hinge'"),
         ("0 0 0\n0 0 1\n", ["--parent", "cupboard"], "names no parts"),
         ("0 0 0\n0 0 1\n", ["--thin", "1"], "takes at least two"),

@@ -9,13 +9,15 @@
 #define MOST_ROUNDS 50
 #define MOST_DAMPING 1e9
 #define HALF_TURN 3.141592653589793
+#define OUTSIDE 1e-9 /* violation of limits that is rounding */
 
-/* A group on its way, in n directions and m coordinates: posterior matrix and vector, best place and belief,
-   trial and its belief. */
+/* A group on its way, in n directions and m coordinates: posterior matrix and vector, best place with belief,
+   curved limits, squares and weights there, trial and its belief. The cost is that of all residuals; the
+   excess is what it is beyond that of the posterior, whose squares are weighted. */
 typedef struct {
-  int n, m, is_done, is_begun;
-  double *matrix, *vector, *x, *prior, *information, *trial, *trial_prior, *trial_information;
-  double cost, prior_cost, trial_cost, posterior_cost, damping;
+  int n, m, limits, is_done, is_begun;
+  double *matrix, *vector, *x, *prior, *information, *trial, *trial_prior, *trial_information, *curved;
+  double cost, prior_cost, trial_cost, posterior_cost, excess, outside, damping;
 } Work;
 
 static int is_finite(const double *a, int n) {
@@ -24,32 +26,65 @@ static int is_finite(const double *a, int n) {
   return 1;
 }
 
-/* Make the trial the best place, if it is better; 0 if there is none to begin at. */
-static int judge(const Problem *p, int64_t g, Work *w, const double *seen, const uint8_t *mask,
-                 const double *whitening) {
+/* What the bounds cost before anything is seen, from x with the curved limits there; below 0 if it is unknown. */
+static double beyond(const Problem *p, int64_t g, const Work *w) {
   const int n = w->n;
-  double matrix[MOST * MOST], vector[MOST], cost = w->trial_cost;
+  double triangle[MOST * MOST], inverse[MOST * MOST], step[MOST], mean[MOST];
+  Bounds b;
+  memcpy(triangle, w->information, n * n * sizeof(double));
+  memcpy(mean, w->prior, n * sizeof(double));
+  if (!factor(triangle, n)) return -1.0;
+  solve(triangle, mean, n);
+  gather(p, g, w->x, w->curved, &b);
+  if (is_within(&b, mean, n)) return 0.0;
+  memcpy(step, mean, n * sizeof(double));
+  invert(triangle, inverse, n);
+  if (!between(&b, inverse, step, n)) return -1.0;
+  for (int i = 0; i < n; i++) step[i] -= mean[i];
+  return fmax(quadratic(w->information, step, n) / 2, 0.0);
+}
+
+/* Make the trial the best place, if it is better; 0 if there is none to begin at. */
+static int judge(const Problem *p, int64_t g, Work *w, int loss, double log_inlier) {
+  const int n = w->n, row = 3 + n;
+  const int64_t *watch = p->watch + p->first_watch[g];
+  const int count = (int)(p->first_watch[g + 1] - p->first_watch[g]);
+  double matrix[MOST * MOST], vector[MOST], cost = w->trial_cost, half = w->trial_cost;
+  double curved[w->limits * row + 1], before[2 * count + 1];
   memcpy(matrix, w->trial_information, n * n * sizeof(double));
   memcpy(vector, w->trial_prior, n * sizeof(double));
-  for (int64_t k = p->first_watch[g]; k < p->first_watch[g + 1]; k++)
-    if (mask[p->watch[k]]) {
-      const double half = add(p, p->watch[k], n, seen, whitening, matrix, vector);
-      p->squares[p->watch[k]] = 2 * half;
-      cost += half;
-    }
+  for (int k = 0; k < count; k++) {
+    before[2 * k] = p->squares[watch[k]], before[2 * k + 1] = p->weights[watch[k]];
+    if (p->mask[watch[k]]) cost += add(p, watch[k], n, loss, log_inlier, matrix, vector, &half);
+  }
+  for (int r = 0; r < n; r++)
+    for (int c = 0; c < r; c++) matrix[c * n + r] = matrix[r * n + c];
+  for (int k = 0; k < w->limits; k++)
+    memcpy(curved + k * row, p->output + p->limit[p->first_limit[g] + k], row * sizeof(double));
   const int fine = isfinite(cost) && is_finite(matrix, n * n) && is_finite(vector, n);
-  if (!fine && !w->is_begun) return 0;
-  if (!fine || (w->is_begun && cost > w->cost + 1e-10 * (1 + fabs(w->cost)))) {
-    w->damping = 10 * w->damping > 1e-3 ? 10 * w->damping : 1e-3;
+  int is_better = fine && (!w->is_begun || cost <= w->cost + 1e-10 * (1 + fabs(w->cost)));
+  if (fine && !is_better && w->limits) {
+    Bounds here, there;
+    gather(p, g, w->x, w->curved, &here);
+    gather(p, g, w->trial, curved, &there);
+    is_better = violation(&here) > OUTSIDE && violation(&there) < violation(&here) / 2;
+  }
+  if (!is_better) {
+    if (!w->is_begun) return 0;
+    for (int k = 0; k < count; k++)
+      p->squares[watch[k]] = before[2 * k], p->weights[watch[k]] = before[2 * k + 1];
+    w->damping = fmax(10 * w->damping, 1e-3);
     return 1;
   }
-  w->is_begun = 1;
   memcpy(w->x, w->trial, w->m * sizeof(double));
   memcpy(w->prior, w->trial_prior, n * sizeof(double));
   memcpy(w->information, w->trial_information, n * n * sizeof(double));
   memcpy(w->matrix, matrix, n * n * sizeof(double));
   memcpy(w->vector, vector, n * sizeof(double));
-  w->prior_cost = w->trial_cost, w->cost = w->posterior_cost = cost;
+  memcpy(w->curved, curved, w->limits * row * sizeof(double));
+  w->prior_cost = w->trial_cost, w->cost = cost, w->posterior_cost = half, w->excess = cost - half;
+  if (!w->is_begun && (w->outside = beyond(p, g, w)) < 0.0) return 0;
+  w->is_begun = 1;
   w->damping = w->damping > 1e-6 ? w->damping / 10 : 0.0;
   return 1;
 }
@@ -58,20 +93,18 @@ static int judge(const Problem *p, int64_t g, Work *w, const double *seen, const
 static int go_on(const Problem *p, int64_t g, Work *w) {
   const int n = w->n;
   const int64_t *own = p->own + p->first[g];
-  double damped[MOST * MOST], inverse[MOST * MOST], step[MOST], low[MOST], high[MOST], back[MOST * MOST];
+  double damped[MOST * MOST], triangle[MOST * MOST], inverse[MOST * MOST], back[MOST * MOST], step[MOST];
+  Bounds b;
   memcpy(damped, w->matrix, n * n * sizeof(double));
   for (int i = 0; i < n; i++) damped[i * n + i] *= 1 + w->damping;
-  double triangle[MOST * MOST];
   memcpy(triangle, damped, n * n * sizeof(double));
   if (!factor(triangle, n)) return 0;
   memcpy(step, w->vector, n * sizeof(double));
   solve(triangle, step, n);
-  bounds(p, g, w->x, low, high);
-  int is_inside = 1;
-  for (int i = 0; i < n; i++) is_inside &= step[i] >= low[i] && step[i] <= high[i];
-  if (!is_inside) {
+  gather(p, g, w->x, w->curved, &b);
+  if (!is_within(&b, step, n)) {
     invert(triangle, inverse, n);
-    if (!between(inverse, step, low, high, n)) return 0;
+    if (!between(&b, inverse, step, n)) return 0;
   }
   double turned = 0.0;
   for (int i = 0; i < n; i++)
@@ -81,176 +114,150 @@ static int go_on(const Problem *p, int64_t g, Work *w) {
   memcpy(w->trial, w->x, w->m * sizeof(double));
   const int moved = move(p, g, w->trial, step, back);
   if (!moved) return 0;
-  double along = 0.0;
-  for (int r = 0; r < n; r++) along += w->prior[r] * step[r];
-  w->trial_cost = w->prior_cost - along + quadratic(w->information, step, n) / 2;
+  w->trial_cost = w->prior_cost - dot(w->prior, step, n) + quadratic(w->information, step, n) / 2;
   memcpy(w->trial_prior, w->prior, n * sizeof(double));
   memcpy(w->trial_information, w->information, n * n * sizeof(double));
   carry(w->trial_information, w->trial_prior, step, moved == 2 ? back : NULL, n);
   if (quadratic(damped, step, n) <= CONVERGED || w->damping > MOST_DAMPING) {
-    along = 0.0;
-    for (int r = 0; r < n; r++) along += w->vector[r] * step[r];
-    w->posterior_cost += quadratic(w->matrix, step, n) / 2 - along;
+    w->posterior_cost += quadratic(w->matrix, step, n) / 2 - dot(w->vector, step, n);
     carry(w->matrix, w->vector, step, moved == 2 ? back : NULL, n);
     memcpy(w->x, w->trial, w->m * sizeof(double));
+    memcpy(w->prior, w->trial_prior, n * sizeof(double));
+    memcpy(w->information, w->trial_information, n * n * sizeof(double));
     w->is_done = 1;
   }
   return 1;
 }
 
-/* What the bounds cost before anything is seen, for a mean at a step from x; below 0 if that is not known. */
-static double beyond(const Problem *p, int64_t g, const Work *w, const double *triangle, const double *mean) {
-  const int n = w->n;
-  double inverse[MOST * MOST], step[MOST], low[MOST], high[MOST], cost = 0.0;
-  int is_inside = 1;
-  bounds(p, g, w->x, low, high);
-  for (int i = 0; i < n; i++) {
-    step[i] = mean[i];
-    is_inside &= mean[i] >= low[i] && mean[i] <= high[i];
+/* Write vector and matrix of a group into those of the whole tangent, of n directions. */
+static void put(const Problem *p, int64_t g, const double *vector, const double *matrix, double *eta,
+                double *information, int64_t n) {
+  const int64_t *place = p->place + p->first[g], size = p->first[g + 1] - p->first[g];
+  for (int64_t r = 0; r < size; r++) {
+    eta[place[r]] = vector[r];
+    for (int64_t c = 0; c < size; c++) information[place[r] * n + place[c]] = matrix[r * size + c];
   }
-  if (is_inside) return 0.0;
-  invert(triangle, inverse, n);
-  if (!between(inverse, step, low, high, n)) return -1.0;
-  for (int r = 0; r < n; r++)
-    for (int c = 0; c < n; c++)
-      cost += (step[r] - mean[r]) * w->information[r * n + c] * (step[c] - mean[c]);
-  return cost > 0.0 ? cost / 2 : 0.0;
 }
 
-/* Update x, η, log evidence of groups and Λ, which lie one after the other; nis and dof of groups are
-   results. Groups of which nothing is seen stay. Returns the number of rounds; below 0, it gave up. */
-EXPORTED int64_t update(const Problem *p, double *belief, const double *seen, const uint8_t *mask,
-                        const double *whitening, const double *log_scale, double *nis, double *dof) {
-  const int64_t n = p->directions, groups = p->groups;
-  double *x = belief, *eta = x + p->coordinates, *evidence = eta + n, *information = evidence + groups;
+/* Update the selected groups; returns the number of rounds; below 0, it gave up. */
+EXPORTED int64_t update(const Problem *p, int64_t loss, double log_inlier) {
+  const int64_t n = p->directions, groups = p->groups, total = p->coordinates;
+  double *x = p->belief, *eta = x + total, *evidence = eta + n, *information = evidence + groups;
+  double *eta_before = p->prior + total, *information_before = eta_before + n + groups;
   Work works[groups];
-  double *room = p->work, before[groups], outside[groups], triangle[MOST * MOST];
+  double *room = p->work;
   int64_t open = 0, rounds = 0;
   for (int64_t g = 0; g < groups; g++) {
     Work *w = works + g;
     const int64_t *place = p->place + p->first[g], *place_x = p->place_x + p->first_x[g];
     const int size = (int)(p->first[g + 1] - p->first[g]), many = (int)(p->first_x[g + 1] - p->first_x[g]);
-    *w = (Work){.n = size, .m = many, .is_done = 1};
+    *w = (Work){.n = size, .m = many, .limits = (int)(p->first_limit[g + 1] - p->first_limit[g])};
     w->vector = room, w->prior = room + size, w->trial_prior = room + 2 * size, w->matrix = room + 3 * size;
     w->information = w->matrix + size * size, w->trial_information = w->information + size * size;
-    w->x = w->trial_information + size * size, w->trial = w->x + many;
-    room = w->trial + many;
-    dof[g] = nis[g] = 0.0;
-    for (int64_t k = p->first_watch[g]; k < p->first_watch[g + 1]; k++)
-      if (mask[p->watch[k]]) dof[g] += (double)p->size[p->watch[k]], w->is_done = 0;
+    w->x = w->trial_information + size * size, w->trial = w->x + many, w->curved = w->trial + many;
+    room = w->curved + w->limits * (3 + size);
+    p->dof[g] = p->nis[g] = 0.0;
+    w->is_done = !p->selected[g];
     if (w->is_done) continue;
     open++;
-    for (int r = 0; r < many; r++) w->x[r] = w->trial[r] = x[place_x[r]];
+    for (int r = 0; r < many; r++) w->trial[r] = x[place_x[r]];
     for (int r = 0; r < size; r++) {
-      w->prior[r] = w->trial_prior[r] = eta[place[r]];
-      for (int c = 0; c < size; c++) w->information[r * size + c] = information[place[r] * n + place[c]];
+      w->trial_prior[r] = eta[place[r]];
+      for (int c = 0; c < size; c++)
+        w->trial_information[r * size + c] = information[place[r] * n + place[c]];
     }
-    memcpy(w->trial_information, w->information, size * size * sizeof(double));
-    memcpy(triangle, w->information, size * size * sizeof(double));
+    double triangle[MOST * MOST], mean[MOST];
+    memcpy(triangle, w->trial_information, size * size * sizeof(double));
     if (!factor(triangle, size)) return -1;
-    before[g] = log_determinant(triangle, size);
-    double mean[MOST], along = 0.0;
-    memcpy(mean, w->prior, size * sizeof(double));
+    memcpy(mean, w->trial_prior, size * sizeof(double));
     solve(triangle, mean, size);
-    for (int r = 0; r < size; r++) along += mean[r] * w->prior[r];
-    w->trial_cost = along / 2;
-    outside[g] = beyond(p, g, w, triangle, mean);
-    if (outside[g] < 0.0) return -7;
+    w->trial_cost = dot(mean, w->trial_prior, size) / 2;
   }
-  memcpy(p->input, x, p->coordinates * sizeof(double));
-  while (open) {
-    if (++rounds > MOST_ROUNDS) return -2;
+  memcpy(p->input, x, total * sizeof(double));
+  for (int64_t i = 0; i < p->observations; i++) p->squares[i] = 0.0, p->weights[i] = 1.0;
+  while (open && rounds < MOST_ROUNDS) {
+    rounds++;
     for (int64_t g = 0; g < groups; g++)
       if (!works[g].is_done)
         for (int r = 0; r < works[g].m; r++) p->input[p->place_x[p->first_x[g] + r]] = works[g].trial[r];
-    if (call(p->compute, p->input, p->output, NULL, NULL)) return -3;
+    if (call(p->compute, p->input, p->output, NULL, NULL)) return -2;
     for (int64_t g = 0; g < groups; g++) {
       Work *w = works + g;
       if (w->is_done) continue;
-      if (!judge(p, g, w, seen, mask, whitening)) return -4;
-      if (!go_on(p, g, w)) return -5;
+      if (!judge(p, g, w, (int)loss, log_inlier)) return -3;
+      if (!go_on(p, g, w)) return -4;
       open -= w->is_done;
     }
   }
   for (int64_t g = 0; g < groups; g++) {
-    Work *w = works + g;
-    if (!dof[g]) continue;
-    const int64_t *place = p->place + p->first[g], *place_x = p->place_x + p->first_x[g];
-    double mean[MOST], along = 0.0;
-    if (p->rates[g]) {
-      memcpy(triangle, w->trial_information, w->n * w->n * sizeof(double));
-      if (!factor(triangle, w->n)) return -8;
-      before[g] = log_determinant(triangle, w->n);
-    }
+    const Work *w = works + g;
+    if (!p->selected[g]) continue;
+    double triangle[MOST * MOST], mean[MOST];
+    memcpy(triangle, w->information, w->n * w->n * sizeof(double));
+    if (!factor(triangle, w->n)) return -5;
+    const double before = log_determinant(triangle, w->n);
     memcpy(triangle, w->matrix, w->n * w->n * sizeof(double));
-    memcpy(mean, w->vector, w->n * sizeof(double));
     if (!factor(triangle, w->n)) return -6;
+    memcpy(mean, w->vector, w->n * sizeof(double));
     solve(triangle, mean, w->n);
-    for (int r = 0; r < w->n; r++) along += mean[r] * w->vector[r];
-    const double least = w->posterior_cost - along / 2;
-    nis[g] = least > 0.0 ? 2 * least : 0.0;
-    evidence[g] += (before[g] - log_determinant(triangle, w->n)) / 2 - (w->posterior_cost - outside[g]);
-    for (int64_t k = p->first_watch[g]; k < p->first_watch[g + 1]; k++)
-      if (mask[p->watch[k]]) evidence[g] -= log_scale[p->watch[k]];
-    for (int r = 0; r < w->m; r++) x[place_x[r]] = w->x[r];
-    for (int r = 0; r < w->n; r++) {
-      eta[place[r]] = w->vector[r];
-      for (int c = 0; c < w->n; c++) information[place[r] * n + place[c]] = w->matrix[r * w->n + c];
+    /* The least cost without limits: in the linear case this is the innovation squared in S⁻¹. */
+    p->nis[g] = fmax(2 * w->posterior_cost - dot(mean, w->vector, w->n), 0.0);
+    evidence[g] += (before - log_determinant(triangle, w->n)) / 2;
+    evidence[g] -= w->posterior_cost + w->excess - w->outside;
+    for (int64_t k = p->first_watch[g]; k < p->first_watch[g + 1]; k++) {
+      const int64_t i = p->watch[k];
+      if (!p->mask[i]) continue;
+      evidence[g] -= p->log_scale[i];
+      if (p->weights[i] >= 0.5) p->dof[g] += (double)p->size[i];
     }
+    for (int r = 0; r < w->m; r++) x[p->place_x[p->first_x[g] + r]] = w->x[r];
+    put(p, g, w->vector, w->matrix, eta, information, n);
+    put(p, g, w->prior, w->information, eta_before, information_before, n);
   }
   return rounds;
 }
 
 /* Move x on, and add variances to the covariance, of each coordinate, where these are the tangent; then to
    the most probable place inside the bounds. Returns 0, or less if it gave up. */
-EXPORTED int64_t predict(const Problem *p, double *belief, const double *moved, const double *grown) {
+EXPORTED int64_t predict(const Problem *p, const double *moved, const double *grown) {
   const int64_t total = p->coordinates;
-  double *x = belief, *eta = x + total, *information = eta + total + p->groups;
+  double *x = p->belief, *eta = x + total, *information = eta + total + p->groups;
   for (int64_t g = 0; g < p->groups; g++) {
     const int64_t *place = p->place + p->first[g];
     const int n = (int)(p->first[g + 1] - p->first[g]);
     double triangle[MOST * MOST], covariance[MOST * MOST], after[MOST * MOST];
-    double step[MOST], vector[MOST], low[MOST], high[MOST];
-    int is_moved = 0, is_inside = 1;
+    double step[MOST], vector[MOST], there[MOST], back[1];
+    Bounds b;
+    int is_moved = 0;
     for (int i = 0; i < n; i++) is_moved |= moved[place[i]] != 0.0 || grown[place[i]] != 0.0;
     if (!is_moved) continue;
     for (int r = 0; r < n; r++)
       for (int c = 0; c < n; c++) triangle[r * n + c] = information[place[r] * total + place[c]];
     if (!factor(triangle, n)) return -1;
     invert(triangle, covariance, n);
-    for (int i = 0; i < n; i++) step[i] = eta[place[i]];
+    for (int i = 0; i < n; i++) step[i] = eta[place[i]], there[i] = x[place[i]] + moved[place[i]];
     solve(triangle, step, n);
     for (int i = 0; i < n; i++) covariance[i * n + i] += grown[place[i]];
     memcpy(triangle, covariance, n * n * sizeof(double));
     if (!factor(triangle, n)) return -2;
     invert(triangle, after, n);
-    for (int i = 0; i < n; i++) {
-      vector[i] = step[i];
-      x[place[i]] += moved[place[i]];
-      low[i] = p->lower[place[i]] - x[place[i]], high[i] = p->upper[place[i]] - x[place[i]];
-      is_inside &= step[i] >= low[i] && step[i] <= high[i];
-    }
+    memcpy(vector, step, n * sizeof(double));
     solve(triangle, vector, n);
-    if (!is_inside && !between(covariance, step, low, high, n)) return -3;
-    for (int r = 0; r < n; r++) {
-      const double to = x[place[r]] + step[r], lower = p->lower[place[r]], upper = p->upper[place[r]];
-      x[place[r]] = to < lower ? lower : to > upper ? upper : to;
-      eta[place[r]] = vector[r];
-      for (int c = 0; c < n; c++) {
-        const double entry = (after[r * n + c] + after[c * n + r]) / 2;
-        information[place[r] * total + place[c]] = entry;
-        eta[place[r]] -= entry * step[c];
-      }
-    }
+    gather(p, g, there, NULL, &b);
+    if (!is_within(&b, step, n) && !between(&b, covariance, step, n)) return -3;
+    carry(after, vector, step, NULL, n);
+    move(p, g, there, step, back);
+    for (int i = 0; i < n; i++) x[place[i]] = there[i];
+    put(p, g, vector, after, eta, information, total);
   }
   return 0;
 }
 
 /* The number of the first pose that is seen and not rigid; -1 if all are. */
-EXPORTED int64_t first_broken(const Problem *p, const double *seen, const uint8_t *mask, double rigid) {
+EXPORTED int64_t first_broken(const Problem *p, double rigid) {
   for (int64_t i = 0; i < p->observations; i++) {
-    const double *t = seen + p->seen[i];
-    if (!mask[i] || !p->is_pose[i]) continue;
+    const double *t = p->numbers + p->seen[i];
+    if (!p->mask[i] || !p->is_pose[i]) continue;
     double worst = fabs(t[15] - 1.0);
     for (int k = 0; k < 3; k++) worst = fmax(worst, fabs(t[12 + k]));
     for (int a = 0; a < 3; a++)

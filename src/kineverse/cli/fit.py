@@ -29,9 +29,10 @@ if TYPE_CHECKING:
 
 HELP = """\
 The table is text, with a head that names its columns: time, part, x, y, z and qx, qy, qz, qw (or roll,
-pitch, yaw, or rx, ry, rz, a rotation vector), in m, rad and s unless a unit follows as in "x [mm]". There is
-a part in each row, or all parts are in one row, and then columns are called door.x. Without a head, 3 columns
-are positions and 7 are poses.
+pitch, yaw, or rx, ry, rz, a rotation vector), with units as in "x [mm]". There is a part in each row, or all
+parts are in one row, and then columns are called door.x. Exports of ROS bags and PlotJuggler, and files of
+OptiTrack, Vicon, TUM, EuRoC and KITTI are read as they are. What the table leaves open, such as the unit of
+angles, shows in the motion, or is asked for. A note says what was assumed; --units and --columns replace it.
 
 Errors of a camera at 30 Hz are alike in neighbouring rows. The time over which the residuals are correlated
 is estimated, and the poses count for as many independent ones as they are worth. --thin N takes N poses,
@@ -65,6 +66,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--columns", metavar="NAMES", help="names of the columns: x,y,z,-,qx,... (- to ignore one)"
     )
     parser.add_argument(
+        "--units",
+        metavar="UNITS",
+        help="units of columns without one: mm, deg, or mm,deg (m, rad, if possible)",
+    )
+    parser.add_argument(
         "--noise",
         metavar="M[,RAD]",
         help="standard deviations of poses, of each coordinate and about each axis: 3mm,1deg (estimated)",
@@ -90,7 +96,9 @@ def run(arguments: argparse.Namespace) -> int:
         )
     require("kineverse fit --picture", {"figures": arguments.picture is not None})
     stated = None if arguments.noise is None else parse_noise(arguments.noise)
-    recording = read_recording(arguments.poses, arguments.columns)
+    recording = read_recording(arguments.poses, arguments.columns, arguments.units)
+    if recording.assumptions:
+        print_notes([f"assumed: {'; '.join(recording.assumptions)}"])
     if recording.ignored:
         print_notes([f"columns that mean nothing here: {', '.join(recording.ignored)}"])
     pair = recording.pair(arguments.parent, arguments.child)
@@ -104,7 +112,8 @@ def run(arguments: argparse.Namespace) -> int:
         learned = identify_recorded_joint(pair, noise, families, independent=arguments.thin is not None)
     written = write_results(arguments, pair, learned)
     if arguments.json:
-        answer = {"poses": arguments.poses, **fit_to_json(pair, learned), **written}
+        read = {"poses": arguments.poses, "assumptions": list(recording.assumptions)}
+        answer = {**read, **fit_to_json(pair, learned), **written}
         print(json.dumps(answer, indent=2, allow_nan=False))
     else:
         print(format_fit(arguments.poses, pair, learned))

@@ -18,7 +18,7 @@ from kineverse.lie import Array
 
 from .noise import pose_covariance
 
-_RIGID = 1e-4  # largest error of a rotation matrix
+RIGID = 1e-4  # largest error of a rotation matrix; a pose in single precision has 1e-6
 # Largest number and smallest standard deviation that double precision can handle.
 _LARGEST, _SMALLEST = 1e9, 1e-7
 _FORMS = "Short forms are a pair of standard deviations (position, orientation) and the {} variances."
@@ -41,12 +41,13 @@ def check_rigid(poses: Array, part: str) -> None:
     off = np.abs(np.swapaxes(rotations, 1, 2) @ rotations - np.eye(3)).max(axis=(1, 2))
     last = np.abs(poses[:, 3] - (0.0, 0.0, 0.0, 1.0)).max(axis=1)
     mirrored = np.linalg.det(rotations) < 0.0
-    wrong = np.flatnonzero((off > _RIGID) | (last > _RIGID) | mirrored)
+    wrong = np.flatnonzero((off > RIGID) | (last > RIGID) | mirrored)
     if len(wrong):
         k = int(wrong[0])
-        how = "mirrors" if mirrored[k] else f"is off by {max(off[k], last[k]):.2g}"
+        how = "mirrors" if mirrored[k] and off[k] <= RIGID else f"is off by {max(off[k], last[k]):.2g}"
+        which = f"Pose {k}" if len(poses) > 1 else "The pose"
         raise InvalidValueError(
-            f"Pose {k} of the {part} is no rigid transform: its matrix {how}. "
+            f"{which} of the {part} is no rigid transform: its matrix {how}. "
             "Quaternions have to be of unit length before they become matrices."
         )
 
@@ -58,10 +59,11 @@ def check_finite(rows: Array, part: str, label: str = "Pose") -> None:
     if not len(wrong):
         return
     k, entry = int(wrong[0]), float(largest[wrong[0]])
+    which = f"{label} {k}" if len(rows) > 1 else f"The {label.lower()}"
     if not math.isfinite(entry):
-        raise InvalidValueError(f"{label} {k} of the {part} is not finite. Leave out what was not observed.")
+        raise InvalidValueError(f"{which} of the {part} is not finite. Leave out what was not observed.")
     raise InvalidValueError(
-        f"{label} {k} of the {part} has a number of {entry:.2g}. None is expected above {_LARGEST:.0g}: "
+        f"{which} of the {part} has a number of {entry:.2g}. None is expected above {_LARGEST:.0g}: "
         "lengths are in metres, angles in radians."
     )
 

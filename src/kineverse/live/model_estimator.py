@@ -15,7 +15,7 @@ import numpy as np
 
 from kineverse.articulations import Fixed, Prismatic, Revolute
 from kineverse.errors import KineverseError
-from kineverse.estimation import Fit, PlausibilityMonitor, pose_covariance
+from kineverse.estimation import Fit, JointVerdict, PlausibilityMonitor, pose_covariance
 from kineverse.estimation.plausibility.report import TestableJoint, find_testable_joints
 from kineverse.geometry.objects import matches_pattern
 from kineverse.grasping.finger_branches import path_to_root
@@ -72,6 +72,7 @@ class Proposal:
     frame: str  # frame that it places
     since: float  # time since which it is proposed [s]
     fit: Fit | None = None  # identified joint, if it is that of an unknown part
+    verdict: JointVerdict | None = None  # on the known joint that it replaces
 
     def write(self, edit: Edit, model: Model) -> bool:
         """Write the operation in an edit of the model; return False if another one has its tag by now."""
@@ -178,6 +179,7 @@ class ModelEstimator:
         self._written: dict[
             str, tuple[Operation | None, Operation | None]
         ] = {}  # before, and as it is served
+        self._repairs: dict[str, JointVerdict] = {}  # verdicts whose replacements were written
         self._taken_back: set[str] = set()
         self._accepted: set[str] = set()
         self._refused: dict[str, float] = {}
@@ -338,7 +340,8 @@ class ModelEstimator:
         kind = next((record.kind for record in records if record.child == known.joint.frame), "")
         if getattr(operation, "kind", kind) != kind:
             operation = self._begin_at_zero(known, operation)
-        self._propose(Proposal(tag, operation, known.served, words, known.joint.child, now))
+        verdict = replace(verdict, replacement=operation)
+        self._propose(Proposal(tag, operation, known.served, words, known.joint.child, now, verdict=verdict))
 
     def _begin_at_zero(self, known: _KnownJoint, operation: Operation) -> Operation:
         """Return a joint of another kind that is 0 where the model's is, positive ahead, and without limits.
@@ -449,7 +452,12 @@ class ModelEstimator:
             relative_to = WORLD if joint.parent == WORLD else None
             frames = [f for f in (joint.parent, joint.child) if f != WORLD]
             monitor = PlausibilityMonitor(
-                model, frames, relative_to=relative_to, decorrelation_time=_CORRELATED, keep=_KEPT
+                model,
+                frames,
+                relative_to=relative_to,
+                decorrelation_time=_CORRELATED,
+                repaired=self._repairs.values(),
+                keep=_KEPT,
             )
             known[joint.tag] = _KnownJoint(joint, served, monitor)
         self._known = known
@@ -523,6 +531,8 @@ class ModelEstimator:
         self.proposals.pop(tag, None)
         self.alarms.pop(tag, None)
         self._known.pop(tag, None)
+        if proposal.verdict is not None:
+            self._repairs[tag] = proposal.verdict
         self.edits, self.last = self.edits + 1, proposal.what
         for part in self._parts.values():
             if part.tag == tag:

@@ -53,7 +53,7 @@ MOVING = 0.6  # share of the cases with a moving observer and a parent that is m
 
 @dataclass(frozen=True, eq=False)
 class JointCase:
-    joint: Joint  # true family
+    joint: str  # true family
     position: float  # standard deviations of the errors [m], [rad]
     orientation: float
     range: float  # range of the joint [rad], [m]
@@ -65,42 +65,46 @@ class JointCase:
 def draw_case(number: int) -> JointCase:
     rng = np.random.default_rng([SEED, number])
     joint: Joint = "revolute" if rng.random() < 0.5 else "prismatic"
-    count = round(_log_uniform(rng, *COUNTS))
-    position, orientation = _log_uniform(rng, *POSITIONS), _log_uniform(rng, *ORIENTATIONS)
+    count = round(log_uniform(rng, *COUNTS))
+    noise = log_uniform(rng, *POSITIONS), log_uniform(rng, *ORIENTATIONS)
     reach = rng.uniform(*RANGES[joint])
-    axis = _random_direction(rng)
+    axis = random_direction(rng)
     lever = rng.uniform(*LEVERS) * _random_orthogonal(rng, axis)
-    turn = rng.uniform(-math.pi, math.pi) * _random_direction(rng)
+    turn = rng.uniform(-math.pi, math.pi) * random_direction(rng)
     along = reach * rng.beta(*BETA, count)[:, None] * axis
     if joint == "prismatic":
         children = translation(along) @ transform(exp_so3(turn), np.zeros(3))
     else:
         children = transform(exp_so3(along), np.zeros(3)) @ transform(exp_so3(turn), lever)
-    parents = None
+    return observe_joint(rng, joint, children, noise, reach)
+
+
+def observe_joint(
+    rng: np.random.Generator, joint: str, children: Array, noise: tuple[float, float], reach: float
+) -> JointCase:
+    """Return a case with noisy observations of poses of the child in the parent."""
+    count, parents = len(children), None
     if rng.random() < MOVING:
         wxyz = rng.standard_normal((count, 4))
         parents = transform(quaternion(np.roll(wxyz, -1, axis=-1)), rng.uniform(-1.0, 1.0, (count, 3)))
         children = parents @ children
 
     def observe(poses: Array) -> Array:
-        errors = rng.standard_normal((count, 6)) * np.repeat([position, orientation], 3)
-        return retract(poses, errors)
+        return retract(poses, rng.standard_normal((count, 6)) * np.repeat(noise, 3))
 
-    return JointCase(
-        joint, position, orientation, reach, None if parents is None else observe(parents), observe(children)
-    )
+    return JointCase(joint, *noise, reach, None if parents is None else observe(parents), observe(children))
 
 
-def _log_uniform(rng: np.random.Generator, least: float, most: float) -> float:
+def log_uniform(rng: np.random.Generator, least: float, most: float) -> float:
     return float(least * (most / least) ** rng.random())
 
 
-def _random_direction(rng: np.random.Generator) -> Array:
+def random_direction(rng: np.random.Generator) -> Array:
     return unit_vector(rng.standard_normal(3))
 
 
 def _random_orthogonal(rng: np.random.Generator, axis: Array) -> Array:
-    return unit_vector(np.cross(axis, _random_direction(rng)))
+    return unit_vector(np.cross(axis, random_direction(rng)))
 
 
 CASES = 1000
@@ -141,8 +145,7 @@ class TypeAnswer:
         return self.probability > SURE and not self.is_ambiguous
 
 
-def identify_case(number: int, setting: Setting) -> TypeAnswer:
-    case = draw_case(number)
+def identify_case(number: int, case: JointCase, setting: Setting) -> TypeAnswer:
     noise = pose_covariance(case.position, case.orientation) if setting.stated else None
     child: Array = case.child if setting.poses else case.child[:, :3, 3]
     found = identify(case.parent, child, noise=noise)
@@ -169,7 +172,7 @@ def identify_cases(
 
 def _identify_chunk(numbers: Sequence[int]) -> list[list[list[TypeAnswer]]]:
     solver.prepare(wait=True)
-    return [[[identify_case(number, setting) for number in numbers] for setting in SETTINGS]]
+    return [[[identify_case(n, draw_case(n), setting) for n in numbers] for setting in SETTINGS]]
 
 
 Answers = Mapping[Setting, Sequence[TypeAnswer]]

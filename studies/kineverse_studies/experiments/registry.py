@@ -54,6 +54,7 @@ EXPERIMENTS: Mapping[str, str] = {
     "sturm": "hinges and sliders learned from recordings of doors and drawers (--data FOLDER)",
     "stream": "a door that a hand opens, tracked and monitored at 30 Hz with correlated errors",
     "joint-types": "types of random hinges and sliders, with and without stated noise",
+    "joint-families": "families of parts that are no hinge and no slider, and of parts that no joint holds",
     "kitchens": "generated kitchens, of which robots open and close all (--seed N --count 50)",
     "table1-open": "grasped objects are opened, also by the papers' two programs (2022 paper, Table I)",
     "table1-push": "twelve objects of a kitchen are pushed shut (both papers, Table I)",

@@ -13,7 +13,7 @@ from synthetic_recordings import noisy, recording, transform
 import kineverse as kv
 from kineverse.errors import InvalidValueError
 from kineverse.estimation import Identifier, identify, pose_covariance
-from kineverse.estimation.identification.curve import CurveMotion, NaturalSpline, PathWidths
+from kineverse.estimation.identification.curve import CurveMotion, NaturalSpline, whiten_path
 from kineverse.lie import log_so3
 
 Array = npt.NDArray[np.float64]
@@ -127,8 +127,8 @@ def test_derivatives_of_a_curve_are_those_of_its_poses(rows: int) -> None:
     quaternions = turns.as_quat() if rows == 6 else np.tile([0.0, 0.0, 0.0, 1.0], (5, 1))
     quaternions *= np.where(np.sum(quaternions * quaternions[0], axis=1) < 0.0, -1.0, 1.0)[:, None]
     places = np.cumsum(random.normal(0.15, 0.1, (5, 3)), axis=0)
-    widths = PathWidths.of_poses(transform(Rotation.from_quat(quaternions), places), rows)
-    motion = CurveMotion.through(rows, NaturalSpline(0.3, 0.25, 5), places, quaternions, widths)
+    whitening = whiten_path(transform(Rotation.from_quat(quaternions), places), rows)
+    motion = CurveMotion.through(rows, NaturalSpline(0.3, 0.25, 5), places, quaternions, whitening)
     values = np.array([[0.1], [0.3], [0.5], [0.9], [1.3], [1.5]])
     linear, little = motion.linearise(values), 1e-6
 

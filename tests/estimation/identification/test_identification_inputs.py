@@ -144,7 +144,7 @@ def test_repeated_observations_count_once_with_their_correlation_time(stated: bo
         assert five.probabilities[name] == pytest.approx(probability, rel=0.1, abs=1e-6)
     np.testing.assert_allclose(five.best.covariance, once.best.covariance, rtol=0.05, atol=1e-9)
     np.testing.assert_allclose(
-        5.0 * sure.best.deviation("axis.x") ** 2, once.best.deviation("axis.x") ** 2, rtol=0.1
+        5.0 * sure["revolute"].deviation("axis.x") ** 2, once.best.deviation("axis.x") ** 2, rtol=0.1
     )
     for wrong in (0.5, np.nan, np.inf):
         with pytest.raises(kv.errors.InvalidValueError, match="at least 1"):

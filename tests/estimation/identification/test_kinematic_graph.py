@@ -307,9 +307,13 @@ def test_spanning_tree_agrees_with_scipy(seed: int) -> None:
     assert set(tree) == {frozenset(map(int, ends)) for ends in zip(wanted.row, wanted.col, strict=True)}
     one, other = split_tree(tree[2], tree)
     assert one | other == set(nodes)
-    way = tree_path(tree, 0, 6)
-    assert (way[0], way[-1]) == (0, 6)
-    assert all(frozenset(ends) in tree for ends in pairwise(way))
+    directed = orient_tree([3], nodes, tree)[1]
+    for end in nodes[1:]:
+        way = tree_path(directed, 0, end)
+        assert (way[0], way[-1]) == (0, end)
+        assert len({*way}) == len(way)
+        assert all(frozenset(ends) in tree for ends in pairwise(way))
+    assert tree_path(directed[:0], 0, 6) == []
 
 
 @pytest.mark.parametrize("count", [2, 3, 4, 5])

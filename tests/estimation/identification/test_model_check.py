@@ -52,7 +52,8 @@ def test_right_noise_is_no_misfit() -> None:
         data = recording(family, count=8 + seed % 9, position=0.01, orientation=0.03, seed=seed)
         child = data.child if seed % 3 else data.child[:, :3, 3]
         identified = identify(data.parent, child, noise=data.covariance)
-        assert not identified.reason
+        if seed % 3:  # positions cannot tell a hinge from a screw
+            assert not identified.reason
         if not math.isnan(identified.misfit):
             misfits.append(identified.misfit)
     assert np.median(misfits) == pytest.approx(1.0, abs=0.1)

@@ -22,7 +22,13 @@ from kineverse.estimation.identification.observations import check_observations
 from kineverse.estimation.identification.result import NoiseDeviations
 from kineverse.estimation.identification.solver import solver
 from kineverse.lie import transform
-from kineverse_studies.experiments.joint_types import Setting, TypeAnswer, identify_case, report_answers
+from kineverse_studies.experiments.joint_types import (
+    Setting,
+    TypeAnswer,
+    draw_case,
+    identify_case,
+    report_answers,
+)
 
 DEG = math.pi / 180
 NOISE = pose_covariance(0.005, 0.02)
@@ -115,7 +121,7 @@ def test_arcs_of_positions_that_look_straight_are_solved_with_long_levers() -> N
 )
 def test_sure_answers_without_stated_noise_are_right(cases: int, right: int, sure: int) -> None:
     setting = Setting(poses=True, stated=False)
-    answers = [identify_case(number, setting) for number in range(cases)]
+    answers = [identify_case(number, draw_case(number), setting) for number in range(cases)]
     assert not [answer for answer in answers if answer.is_sure and not answer.is_right]
     assert sum(answer.is_right for answer in answers) >= right
     assert sum(answer.is_sure for answer in answers) >= sure

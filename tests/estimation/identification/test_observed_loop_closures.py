@@ -18,10 +18,11 @@ from kineverse.estimation.identification.families import JOINT_FAMILIES, GroupMo
 from kineverse.estimation.identification.kinematic_graph.graph import tree_path
 from kineverse.estimation.identification.kinematic_graph.loop_closures import (
     CONSTRAINED_COMPONENTS,
-    DependentCoordinates,
+    ClosureEquations,
     ObservedLoop,
-    Twists,
+    Ring,
     close_loops,
+    resolve,
 )
 from kineverse.estimation.identification.kinematic_graph.pairwise import identify_pair
 from kineverse.estimation.identification.observations import check_tracks, exact_track
@@ -172,7 +173,7 @@ def test_a_slider_crank_is_closed() -> None:
 
 
 def test_a_loop_can_be_closed_at_each_of_its_joints() -> None:
-    """Here it is a slider, which holds other components than a hinge, in axes that are turned to suit."""
+    """Here it is a slider, which holds other components than a hinge."""
     values = np.random.default_rng(1).uniform(-1.2, 1.2, (40, 1))
     poses = data(slider_crank(), ["crank", "rod", "slider"], values, 2)
     known = {"world": exact_track(40), **check_tracks(poses, NOISE)}
@@ -180,7 +181,8 @@ def test_a_loop_can_be_closed_at_each_of_its_joints() -> None:
     closing, *others = (identify_pair(known, *both, SOME) for both in ends)
     assert closing is not None
     tree = {frozenset((joint.parent, joint.child)): joint for joint in others if joint is not None}
-    way = [tree[frozenset(ends)] for ends in pairwise(tree_path(tree, "world", "slider"))]
+    directed = [("world", "crank"), ("crank", "rod"), ("rod", "slider")]
+    way = [tree[frozenset(ends)] for ends in pairwise(tree_path(directed, "world", "slider"))]
     assert len(way) == 3
     ((_, plan),) = close_loops([ObservedLoop(closing, way)], way)
     assert plan is not None
@@ -240,24 +242,34 @@ def test_a_loop_of_balls_is_reported_and_left_open() -> None:
     assert {"crank", "rod", "rocker"} == set(graph.model(close=False).frames)
 
 
-def test_dependent_coordinates_are_resolved_transitively() -> None:
+def test_coordinates_of_linked_loops_are_resolved() -> None:
+    """Speeds that obey the equations of other loops give the same twist per independent coordinate."""
     random, times = np.random.default_rng(0), np.arange(7)
-    twists = Twists(("a", "b", "c", "d"), times, random.normal(size=(7, 6, 4)))
-    b_by_a, b_by_c, c_by_a, c_by_d = random.normal(size=(4, 7))
-    followers = DependentCoordinates()
-    motion = Twists(("a", "b", "c"), times, np.zeros((7, 6, 3)))
-    followers.add(motion, [1], np.stack([b_by_a, b_by_c], axis=1)[:, None])
-    assert followers.leading == {"a", "c"}
-    # Half of it was observed only at some of the times.
-    some = times[2:]
-    motion = Twists(("d", "c", "a"), some, np.zeros((5, 6, 3)))
-    followers.add(motion, [1], np.stack([c_by_d, c_by_a], axis=1)[2:, None])
-    identified = followers.resolve(twists)
-    assert np.array_equal(identified.times, some)
-    a, b, c, d = np.moveaxis(twists.twists, 2, 0)
-    by_a = a + b * (b_by_a + b_by_c * c_by_a)[:, None] + c * c_by_a[:, None]
-    by_d = d + b * (b_by_c * c_by_d)[:, None] + c * c_by_d[:, None]
-    wanted = {"a": by_a[2:], "d": by_d[2:]}
-    assert set(identified.names) == set(wanted)
-    for k, x in enumerate(identified.names):
-        assert np.allclose(identified.twists[:, :, k], wanted[x])
+
+    def ring(names: str, some: Array) -> Ring:
+        return Ring(
+            np.eye(4), np.eye(4), "rigid", (*names,), some, random.normal(size=(len(some), 6, len(names)))
+        )
+
+    def closed(names: str, dependent: str, some: Array) -> ClosureEquations:
+        return ClosureEquations(ring(names, some), [0], [*names], [dependent], some[0], some)
+
+    # Half of it was observed only at some of the times, and another loop shares no coordinate.
+    loops = [closed("abc", "b", times), closed("cda", "c", times[2:]), closed("xy", "x", times[:1])]
+    one = ring("abcd", times)
+    names, when, twists = resolve(one, loops)
+    assert names == ["a", "d"]
+    assert np.array_equal(when, times[2:])
+    for k, time in enumerate(when):
+        speeds = dict(zip("ad", random.normal(size=2), strict=True))
+        rows = {x: np.zeros(4) for x in "bc"}
+        for each, x in zip(loops, "bc", strict=False):
+            at = np.searchsorted(each.times, time)
+            rows[x][["abcd".index(y) for y in each.ring.names]] = each.ring.equations()[at, 0]
+        a = np.array([*rows.values()])
+        speeds |= dict(
+            zip("bc", np.linalg.solve(a[:, 1:3], -a[:, [0, 3]] @ [speeds["a"], speeds["d"]]), strict=True)
+        )
+        assert np.allclose(
+            one.twists[time] @ [speeds[x] for x in "abcd"], twists[k] @ [speeds["a"], speeds["d"]]
+        )

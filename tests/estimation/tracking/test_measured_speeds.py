@@ -110,7 +110,9 @@ def test_a_base_is_followed_by_default():
 
 
 def test_a_full_pose_finds_a_base_that_started_elsewhere():
-    tracker = observe_base(outliers=True, process="position")
+    model, start = make_body(wheels=True), dict.fromkeys(("b/x", "b/y", "b/angle"), 0.0)
+    known = {"start": start, "uncertainty": dict.fromkeys(start, 0.05)}
+    tracker = Tracker(model, ["b"], outliers=True, process="position", **known)
     pose = kv.rotation_z(2.0)()
     for at in (0.0, 0.1):
         tracker.update({"b": np.eye(4)}, at=at)

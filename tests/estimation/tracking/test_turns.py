@@ -39,7 +39,7 @@ def test_estimate_follows_a_joint_over_three_turns_and_back(is_compiled, process
     if is_compiled:
         assert tracker.wait()
     else:
-        tracker._update_step.native = tracker._update_step.inlier_solver = None
+        tracker._update_step.native = None
     observer, before, most = NoisyObserver(MODEL, ["pinion"]), 0.3, 0.0
     for k in range(120):
         truth = 0.3 + 10.0 * (1.0 - np.cos(0.05 * k))

@@ -9,14 +9,24 @@ typedef struct {
   /* Of each observation: whether it is a pose, its size, and where its numbers are. */
   const int64_t *is_pose, *size, *value, *slope, *seen, *white;
   /* The directions of group g are place[first[g]] to place[first[g + 1]], of the whole tangent, and own says
-     which of its coordinates is one of them, or -1; likewise its coordinates, and what is seen of it. */
-  const int64_t *first, *place, *own, *first_x, *place_x, *first_watch, *watch;
+     which of its coordinates is one of them, or -1; likewise its coordinates, what is seen of it, and where
+     in the output its curved limits are: value, bounds and slopes. */
+  const int64_t *first, *place, *own, *first_x, *place_x, *first_watch, *watch, *first_limit, *limit;
   /* Rates and steps of the groups that are moved by others' speeds, and which rates change on the way. */
   const Function *rates, *step;
   const int64_t *first_bend;
-  const double *bend;
-  const double *period, *lower, *upper;
-  double *input, *output, *work, *squares;
+  const double *bend, *period, *lower, *upper;
+  double *input, *output, *work;
+  /* A reading: numbers, which are measured, whitening, logarithms of their scales, and of the densities of
+     outliers relative to the peak of the noise. */
+  const double *numbers;
+  const uint8_t *mask;
+  const double *whitening, *log_scale, *outlier;
+  /* Groups to update, the belief (x, η, log evidence of groups and Λ, one after the other), the prior about
+     the same state, and of groups: normalised innovation squared, degrees of freedom. */
+  const uint8_t *selected;
+  double *belief, *prior, *nis, *dof;
+  double *squares, *weights; /* of the residuals of each observation */
 } Problem;
 
 #define LONGEST 0.1 /* of a step of Runge and Kutta */
@@ -121,13 +131,26 @@ static int move(const Problem *p, int64_t g, double *x, const double *step, doub
   return turns ? 2 : 1;
 }
 
-/* What a step may be at most. */
-static void bounds(const Problem *p, int64_t g, const double *x, double *low, double *high) {
+#define FAR 1e300
+
+/* The bounds on a step from x, where the curved limits are these; without them, if NULL. */
+static void gather(const Problem *p, int64_t g, const double *x, const double *curved, Bounds *b) {
   const int n = (int)(p->first[g + 1] - p->first[g]);
+  const int limits = curved ? (int)(p->first_limit[g + 1] - p->first_limit[g]) : 0;
   const int64_t *own = p->own + p->first[g], *place = p->place_x + p->first_x[g];
+  b->count = 0;
   for (int i = 0; i < n; i++) {
-    low[i] = own[i] < 0 ? -INFINITY : p->lower[place[own[i]]] - x[own[i]];
-    high[i] = own[i] < 0 ? INFINITY : p->upper[place[own[i]]] - x[own[i]];
+    if (own[i] < 0) continue;
+    const int k = b->count++;
+    for (int c = 0; c < n; c++) b->rows[k * n + c] = c == i;
+    b->low[k] = p->lower[place[own[i]]] - x[own[i]], b->high[k] = p->upper[place[own[i]]] - x[own[i]];
+  }
+  for (int i = 0; i < limits; i++, curved += 3 + n) {
+    const int k = b->count++;
+    /* Conditional bounds are infinite while inactive, and so may be the value that they bound. */
+    const double value = fmax(-FAR, fmin(FAR, curved[0]));
+    b->low[k] = curved[1] - value, b->high[k] = curved[2] - value;
+    memcpy(b->rows + k * n, curved + 3, n * sizeof(double));
   }
 }
 

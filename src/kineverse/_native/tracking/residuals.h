@@ -21,13 +21,31 @@ static void logarithm(const double r[9], double v[3]) {
   for (int i = 0; i < 3; i++) v[i] *= scale;
 }
 
-/* Add one observation to matrix and vector; return half the square of its error. */
-static double add(const Problem *p, int64_t i, int n, const double *seen, const double *whitening,
-                  double *matrix, double *vector) {
+enum { GAUSSIAN, CAUCHY, MIXTURE };
+
+/* Whether a residual counts as an inlier with this probability; its cost is the negative log density. */
+static double weigh(const Problem *p, int64_t i, int loss, double log_inlier, double square, double *cost) {
+  const double size = (double)p->size[i];
+  *cost = square / 2;
+  if (loss == GAUSSIAN || !isfinite(square)) return 1.0;
+  if (loss == CAUCHY) {
+    *cost = (1 + size) / 2 * log1p(square);
+    return (1 + size) / (1 + square);
+  }
+  const double inlier = log_inlier - square / 2, outlier = p->outlier[i];
+  const double total = fmax(inlier, outlier) + log1p(exp(-fabs(inlier - outlier)));
+  *cost = -total;
+  return exp(inlier - total);
+}
+
+/* Add one weighted observation to the lower triangle of a matrix, a vector and half its square to the sum;
+   return its cost. */
+static double add(const Problem *p, int64_t i, int n, int loss, double log_inlier, double *matrix,
+                  double *vector, double *half) {
   const int d = (int)p->size[i];
-  const double *value = p->output + p->value[i], *slope = p->output + p->slope[i], *z = seen + p->seen[i];
-  const double *white = whitening + p->white[i];
-  double error[WIDE], turned[3 * MOST], row[MOST + 1];
+  const double *value = p->output + p->value[i], *slope = p->output + p->slope[i];
+  const double *z = p->numbers + p->seen[i], *white = p->whitening + p->white[i];
+  double error[WIDE], whitened[WIDE], turned[3 * MOST], rows[WIDE * MOST];
   if (p->is_pose[i]) {
     double relative[9], v[3];
     for (int a = 0; a < 3; a++)
@@ -37,9 +55,8 @@ static double add(const Problem *p, int64_t i, int n, const double *seen, const 
     logarithm(relative, v);
     for (int a = 0; a < 3; a++) error[a] = z[4 * a + 3] - value[9 + a], error[3 + a] = v[a];
     const double squared = v[0] * v[0] + v[1] * v[1] + v[2] * v[2], angle = sqrt(squared);
-    const double half = angle / 2;
     const double factor =
-        angle > 0.02 ? (1 - half / tan(half)) / (4 * half * half) : 1.0 / 12 + squared / 720;
+        angle > 0.02 ? (1 - angle / 2 / tan(angle / 2)) / squared : 1.0 / 12 + squared / 720;
     /* Jr⁻¹ a = a + ½ v × a + factor v × (v × a) */
     for (int c = 0; c < n; c++) {
       const double a[3] = {slope[3 * n + c], slope[4 * n + c], slope[5 * n + c]};
@@ -55,9 +72,9 @@ static double add(const Problem *p, int64_t i, int n, const double *seen, const 
       if (isfinite(p->period[i])) error[a] -= p->period[i] * rint(error[a] / p->period[i]);
     }
   }
-  double cost = 0.0;
+  double square = 0.0, cost;
   for (int a = 0; a < d; a++) {
-    double e = 0.0;
+    double e = 0.0, *row = rows + a * n;
     for (int c = 0; c < n; c++) row[c] = 0.0;
     for (int b = 0; b <= a; b++) {
       const double weight = white[a * d + b];
@@ -66,11 +83,20 @@ static double add(const Problem *p, int64_t i, int n, const double *seen, const 
       e += weight * error[b];
       for (int c = 0; c < n; c++) row[c] += weight * from[c];
     }
-    cost += e * e;
+    whitened[a] = e;
+    square += e * e;
+  }
+  const double weight = weigh(p, i, loss, log_inlier, square, &cost);
+  p->squares[i] = square, p->weights[i] = weight;
+  *half += weight * square / 2;
+  for (int a = 0; a < d; a++) {
+    const double *row = rows + a * n;
     for (int r = 0; r < n; r++) {
-      vector[r] += row[r] * e;
-      for (int c = 0; c < n; c++) matrix[r * n + c] += row[r] * row[c];
+      const double much = weight * row[r];
+      if (much == 0.0) continue; /* most links move with few coordinates */
+      vector[r] += much * whitened[a];
+      for (int c = 0; c <= r; c++) matrix[r * n + c] += much * row[c];
     }
   }
-  return cost / 2;
+  return cost;
 }

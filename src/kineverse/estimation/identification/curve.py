@@ -14,7 +14,7 @@ curve is a change of joint values.
 **Prior.** The mean pose has the density that all families share. The differences between the ends and, times
 a curvature, the second differences of the knots are Gaussian. Their widths are those of the observations
 along the principal directions of their positions and of their rotations: a curve in a plane pays little for
-being in space, but it pays for the plane.
+being in space.
 """
 
 from __future__ import annotations
@@ -53,10 +53,9 @@ KNOTS = (3, 4, 5, 7, 9, 12, 16, 21)  # numbers K of knots that are compared
 _LOG_KNOT = -0.5  # log prior of a number of knots, for each knot
 # Standard deviation of the second derivative of a curve of width 1 and length 1, and its bound for few knots.
 _CURVATURE = 20.0
-# Log density of a width, which is log-uniform over several decades, and least width relative to the largest.
-_LOG_WIDTH, _LEAST_WIDTH = -2.0, 1e-4
-# Range of each of the three angles of principal directions, whose signs do not matter: (8π² / 4)^(1/3).
-_ANGLES = (2.0 * math.pi**2) ** (1.0 / 3.0)
+# Log density of a width, which is log-uniform over several decades, and of its direction, and least width
+# relative to the largest.
+_LOG_WIDTH, _LEAST_WIDTH = -3.0, 1e-4
 
 
 class SplineWeights(NamedTuple):
@@ -111,47 +110,17 @@ class NaturalSpline:
         return SplineWeights(values + beyond * rates, rates)
 
 
-@dataclass(frozen=True, eq=False)
-class PathWidths:
-    """Widths of poses along the principal directions of their positions and of their rotations."""
-
-    directions: tuple[Array, ...]  # (3, 3) each
-    widths: tuple[Array, ...]  # twice the standard deviations along them, (3,) each, [m] and [rad]
-
-    @staticmethod
-    def of_poses(poses: Array, rows: int) -> PathWidths:
-        """Return the widths of poses (N, 4, 4), or of positions for 3 rows."""
-        places, turns = poses[:, :3, 3], poses[:, :3, :3]
-        vectors = [places - places.mean(axis=0), log_so3(turns @ mean_rotation(turns).T)][: rows // 3]
-        directions, widths = [], []
-        for each in vectors:
-            _, sizes, along = np.linalg.svd(each, full_matrices=False)
-            size = 2.0 * sizes / math.sqrt(len(each))
-            directions.append(along.T)
-            widths.append(np.maximum(size, _LEAST_WIDTH * max(float(size.max()), _LEAST_WIDTH)))
-        return PathWidths(tuple(directions), tuple(widths))
-
-    @cached_property
-    def whitening(self) -> Array:
-        """Matrix (m, m) that divides a twist by the widths."""
-        result = np.zeros((3 * len(self.widths), 3 * len(self.widths)))
-        for k, (directions, widths) in enumerate(zip(self.directions, self.widths, strict=True)):
-            result[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] = (directions / widths) @ directions.T
-        return result
-
-    def log_density(self, count: int) -> float:
-        """Return the log prior of widths and directions, times the uncertainty that ``count`` knots leave."""
-        log = 0.0
-        for widths in self.widths:
-            log += _LOG_WIDTH * len(widths)
-            for i, j in ((0, 1), (0, 2), (1, 2)):
-                information = count * (widths[i] / widths[j] - widths[j] / widths[i]) ** 2
-                log -= max(0.0, math.log(_ANGLES) + 0.5 * math.log(max(information, 1e-9) / math.tau))
-        return log
-
-    def scaled(self, unit: float) -> Self:
-        """Return the widths with lengths in another unit, which is smaller by a factor."""
-        return replace(self, widths=(unit * self.widths[0], *self.widths[1:]))
+def whiten_path(poses: Array, rows: int) -> Array:
+    """Return the matrix (m, m) that divides a twist by the widths of poses along principal directions."""
+    places, turns = poses[:, :3, 3], poses[:, :3, :3]
+    result = np.zeros((rows, rows))
+    for k, vectors in enumerate([places - places.mean(axis=0), log_so3(turns @ mean_rotation(turns).T)]):
+        if 3 * k < rows:
+            _, sizes, along = np.linalg.svd(vectors, full_matrices=False)
+            width = 2.0 * sizes / math.sqrt(len(vectors))
+            width = np.maximum(width, _LEAST_WIDTH * max(float(width.max()), _LEAST_WIDTH))
+            result[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] = (along.T / width) @ along
+    return result
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,7 +132,7 @@ class CurveMotion:
     positions: Array  # of the knots, (K, 3)
     quaternions: Array  # (K, 4)
     across: Array  # twists by which the parameters move each knot, (K, m, m - 1)
-    widths: PathWidths  # of the prior
+    whitening: Array  # (m, m), see :func:`whiten_path`
     lever: float = LEVER  # length ℓ of a rotation by one radian
 
     name = CURVE
@@ -176,12 +145,12 @@ class CurveMotion:
         spline: NaturalSpline,
         positions: Array,
         quaternions: Array,
-        widths: PathWidths,
+        whitening: Array,
         lever: float = LEVER,
     ) -> CurveMotion:
         """Return the curve through poses at the knots."""
         none = np.zeros((spline.count, rows, 0))
-        motion = CurveMotion(rows, spline, positions, unit_vector(quaternions), none, widths, lever)
+        motion = CurveMotion(rows, spline, positions, unit_vector(quaternions), none, whitening, lever)
         tangents = motion.linearise(spline.knots[:, None]).by_joints[:, :, 0] * motion.lengths
         *_, directions = np.linalg.svd(tangents[:, None, :])
         across = np.swapaxes(directions[:, 1:], 1, 2)
@@ -247,7 +216,7 @@ class CurveMotion:
         steps = np.arange(count - 1)
         by[steps, :, steps] = -self.across[:-1]
         by[steps, :, steps + 1] = self.across[1:]
-        whitening, bend = self.widths.whitening, min(1.0, _CURVATURE / (count - 1) ** 2)
+        whitening, bend = self.whitening, min(1.0, _CURVATURE / (count - 1) ** 2)
         moved = self._differences
         residuals = np.concatenate([np.diff(moved, axis=0) / bend, moved.sum(axis=0)[None]])
         derivatives = np.concatenate([np.diff(by, axis=0) / bend, by.sum(axis=0)[None]])
@@ -268,7 +237,7 @@ class CurveMotion:
         # Volume of mean poses per unit of the steps that move them.
         moves = np.concatenate([self.across[count // 2], self.linearise(mean[None, :]).by_joints[0]], axis=1)
         log += float(np.linalg.slogdet(moves)[1])
-        log += self.widths.log_density(count) + _LOG_KNOT * count
+        log += _LOG_WIDTH * self.rows + _LOG_KNOT * count
         log -= math.log(sum(math.exp(_LOG_KNOT * knots) for knots in KNOTS))
         return log, np.zeros(self.size + 1)
 
@@ -291,9 +260,10 @@ class CurveMotion:
     def scaled(self, unit: float) -> Self:
         """Return the curve with lengths in another unit, which is smaller by a factor."""
         spline = replace(self.spline, first=unit * self.spline.first, step=unit * self.spline.step)
-        across, widths = self.across.copy(), self.widths.scaled(unit)
+        across, whitening = self.across.copy(), self.whitening.copy()
         across[:, 3:] /= unit
-        moved = replace(self, spline=spline, across=across, widths=widths, lever=unit * self.lever)
+        whitening[:3] /= unit
+        moved = replace(self, spline=spline, across=across, whitening=whitening, lever=unit * self.lever)
         return replace(moved, positions=unit * self.positions)
 
     def _splines(self, joint: Expression, values: Array) -> Sequence[Expression]:
@@ -330,13 +300,10 @@ def _quotient(a: Array, b: Array) -> Array:
 
 
 FEWEST_POSES = 5  # least number of observations of a curve
-
-# Largest number of knots of the first curve, steps of the solver in a round, and rounds of projection.
-_COARSE, _STEPS, _ROUNDS = 7, 6, 2
-_SAMPLES = 24  # points of a curve among which the nearest is searched, for each knot
+# Largest number of knots of the first curve, steps of the solver in a round, and points of a curve for each
+# knot among which the nearest is searched.
+_COARSE, _STEPS, _SAMPLES = 7, 6, 24
 _DENSEST = 0.75  # largest number of knots relative to the number of observations
-# Log evidence that a curve may lack, and the part of it that twice as many knots must leave at most.
-_HOPELESS, _LEFT = 30.0, 0.6
 # Largest numbers of observations among which paths are searched, and to which a shape is fitted.
 _MOST, _MOST_FITTED = 120, 240
 _EQUAL = 1e-9  # largest difference of poses that are equal
@@ -351,54 +318,38 @@ def may_be_curve(observations: Observations) -> bool:
 def fit_curve(
     observations: Observations,
     covariance: Array,
-    orders: Iterable[Array] = (),
-    log_evidence: Callable[[Solution[FamilyMember]], float] | None = None,
-    competitor: float = -math.inf,
-) -> Scored | None:
-    """Return the most probable curve through observations; None if they are too few for one, or equal."""
-    if not may_be_curve(observations):
-        return None
+    orders: Iterable[Array],
+    log_evidence: Callable[[Solution[FamilyMember]], float],
+) -> Scored:
+    """Return the most probable curve through observations that :func:`may_be_curve` accepts."""
     if len(observations) > _MOST_FITTED:
         some = np.linspace(0, len(observations) - 1, _MOST_FITTED).round().astype(int)
         thinned = observations.select(some), covariance[some], [order[some] for order in orders]
-        known = fit_curve(*thinned, log_evidence)
-        assert known is not None  # there are enough observations
-        motion = _as_curve(known.solution)
-        values = _nearest(observations, _mean_deviations(known.solution.covariance), motion)
-        solution = levenberg_marquardt(observations, motion, values, steps=_STEPS)
-        return Scored(solution, stated_log_evidence(solution))
-    score, deviations = log_evidence or stated_log_evidence, _mean_deviations(covariance)
+        motion, deviations = _as_curve(fit_curve(*thinned, log_evidence).solution), _deviations(covariance)
+        return _scored(observations, motion, _nearest(observations, deviations, motion))
+    deviations = _deviations(covariance)
     possible = [count for count in KNOTS if count <= _DENSEST * len(observations)]
     middle = max(k for k, count in enumerate(possible) if count <= _COARSE)
     points = _whitened(observations.relative, observations.relative, deviations)
     *_, directions = np.linalg.svd(points, full_matrices=False)
     in_time = np.arange(len(points), dtype=np.float64)
     candidates = [in_time, points @ directions[0], _length_along_path(points), *orders]
-    starts = [(_regressed(observations, along, possible[middle]), True) for along in candidates]
-    # In the order of time, even knots would be poor where the motion pauses.
-    starts.append((_regressed(observations, in_time, possible[middle], even=False), False))
-    begun = [(_refine(observations, deviations, motion, 1, even), even) for motion, even in starts]
-    start, even = min(begun, key=lambda pair: pair[0].cost)
-
-    def fit(motion: CurveMotion, count: int) -> Scored:
-        solution = _refine(observations, deviations, _with_knots(motion, count, even), _ROUNDS, even)
-        return Scored(solution, score(solution))
-
-    best = latest = fit(start.motion, possible[middle])
-    worse = 0
-    for count in possible[middle + 1 :]:
-        missing = competitor - latest.log_evidence
-        latest = fit(_as_curve(latest.solution), count)
-        worse = 0 if latest.log_evidence > best.log_evidence else worse + 1
-        best = max(best, latest, key=lambda fitted: fitted.log_evidence)
-        if worse == 2 or competitor - latest.log_evidence > max(_HOPELESS, _LEFT * missing):
-            break
-    if best.log_evidence > competitor - _HOPELESS:
-        for count in reversed(possible[:middle]):
-            fewer = fit(start.motion, count)
-            if fewer.log_evidence < best.log_evidence:
+    begun = [
+        _refine(observations, deviations, _regressed(observations, along, possible[middle]), 1)
+        for along in candidates
+    ]
+    first = min(begun, key=lambda solution: solution.cost).motion
+    best: Scored | None = None
+    for counts in (possible[middle:], possible[middle - 1 :: -1] if middle else []):
+        motion, worse = first, 0
+        for count in counts:
+            solution = _refine(observations, deviations, _with_knots(motion, count), 2)
+            fitted, motion = Scored(solution, log_evidence(solution)), solution.motion
+            worse = worse + 1 if best is not None and fitted.log_evidence < best.log_evidence else 0
+            best = fitted if best is None or not worse else best
+            if worse == 2:
                 break
-            best = fewer
+    assert best is not None  # there are at least three knots
     return continue_curve(observations, best.solution)
 
 
@@ -407,12 +358,16 @@ def continue_curve(observations: Observations, before: Solution[FamilyMember]) -
     motion, known, values = _as_curve(before), len(before.values), before.values
     if known < len(observations):
         new = observations.select(slice(known, None))
-        values = np.concatenate([values, _nearest(new, _mean_deviations(before.covariance), motion)])
+        values = np.concatenate([values, _nearest(new, _deviations(before.covariance), motion)])
+    return _scored(observations, motion, values)
+
+
+def _scored(observations: Observations, motion: CurveMotion, values: Array) -> Scored:
     solution = levenberg_marquardt(observations, motion, values, steps=2 * _STEPS)
-    return Scored(solution, stated_log_evidence(solution))
+    return Scored(solution, laplace_evidence(solution).log_evidence)
 
 
-def _mean_deviations(covariance: Array) -> Array:
+def _deviations(covariance: Array) -> Array:
     return np.asarray(np.sqrt(np.einsum("nii->ni", covariance).mean(axis=0)))
 
 
@@ -420,11 +375,6 @@ def _as_curve(solution: Solution[FamilyMember]) -> CurveMotion:
     motion = solution.motion
     assert isinstance(motion, CurveMotion)
     return motion
-
-
-def stated_log_evidence(solution: Solution[FamilyMember]) -> float:
-    """Return the log evidence of a curve for noise of the size of its covariances."""
-    return laplace_evidence(solution).log_evidence
 
 
 def _whitened(poses: Array, around: Array, deviations: Array) -> Array:
@@ -446,15 +396,13 @@ def _length_along_path(points: Array) -> Array:
     for k in range(len(some)):
         np.minimum(costs, costs[:, k, None] + costs[None, k], out=costs)
     first = int(np.argmax(costs[int(np.argmax(costs[0]))]))
-    reached = np.argsort(costs[first], kind="stable")
-    along = np.empty(len(some))
-    along[reached] = np.arange(len(some))
+    along = np.argsort(np.argsort(costs[first], kind="stable")).astype(np.float64)
     result = np.asarray(along[np.argsort(distances, axis=1)[:, :2]].mean(axis=1))
     result[some] = along
     return result
 
 
-def _regressed(observations: Observations, along: Array, count: int, even: bool = True) -> CurveMotion:
+def _regressed(observations: Observations, along: Array, count: int) -> CurveMotion:
     spline = NaturalSpline(0.0, (len(along) - 1) / (count - 1), count)
     weights = spline.weights(np.arange(len(along), dtype=np.float64)).values
     relative = observations.relative[np.argsort(along, kind="stable")]
@@ -465,48 +413,30 @@ def _regressed(observations: Observations, along: Array, count: int, even: bool 
     system = np.concatenate([weights, 1e-3 * np.diff(np.eye(count), n=2, axis=0)])
     right = np.vstack([np.hstack([relative[:, :3, 3], turns]), np.zeros((count - 2, 7))])
     values = np.linalg.lstsq(system, right, rcond=None)[0]
-    widths = PathWidths.of_poses(relative, observations.rows)
-    return _resampled(observations.rows, spline, values[:, :3], values[:, 3:], count, even, widths)
+    whitening = whiten_path(relative, observations.rows)
+    return _with_knots(
+        CurveMotion.through(observations.rows, spline, values[:, :3], values[:, 3:], whitening), count
+    )
 
 
-def _resampled(
-    rows: int,
-    spline: NaturalSpline,
-    positions: Array,
-    quaternions: Array,
-    count: int,
-    even: bool,
-    widths: PathWidths,
-    lever: float = LEVER,
-) -> CurveMotion:
-    """Return a curve with other knots; the joint value becomes the length along it if ``even``."""
-    at = np.linspace(spline.first, spline.last, _SAMPLES * count)
-    weights = spline.weights(at).values
-    places, turns = weights @ positions, weights @ quaternions
-    steps = np.sum(np.diff(places, axis=0) ** 2, axis=1)
-    if rows == 6:
-        turn = quaternion(turns)
-        steps += lever**2 * np.sum(log_so3(turn[1:] @ np.swapaxes(turn[:-1], 1, 2)) ** 2, axis=1)
+def _with_knots(motion: CurveMotion, count: int, ends: tuple[float, float] | None = None) -> CurveMotion:
+    """Return a curve with other knots, evenly distributed over the length from one end to the other."""
+    at = np.linspace(*(ends or (motion.spline.first, motion.spline.last)), _SAMPLES * count)
+    poses = motion.linearise(at[:, None]).pose
+    steps = np.sum(np.diff(poses[:, :3, 3], axis=0) ** 2, axis=1)
+    if motion.rows == 6:
+        turns = log_so3(poses[1:, :3, :3] @ np.swapaxes(poses[:-1, :3, :3], 1, 2))
+        steps += motion.lever**2 * np.sum(turns**2, axis=1)
     lengths = np.concatenate([[0.0], np.cumsum(np.sqrt(steps))])
     whole = max(float(lengths[-1]), 1e-6)
     knots = NaturalSpline(-0.5 * whole, whole / (count - 1), count)
-    chosen = np.interp(knots.knots + 0.5 * whole, lengths, at) if even else np.linspace(at[0], at[-1], count)
-    new = spline.weights(chosen).values
-    return CurveMotion.through(rows, knots, new @ positions, new @ quaternions, widths, lever)
-
-
-def _with_knots(
-    motion: CurveMotion, count: int, even: bool, ends: tuple[float, float] | None = None
-) -> CurveMotion:
-    first, last = ends or (motion.spline.first, motion.spline.last)
-    part = NaturalSpline(first, (last - first) / (4 * count), 4 * count + 1)
-    weights = motion.spline.weights(part.knots).values
-    positions, quaternions = weights @ motion.positions, weights @ motion.quaternions
-    return _resampled(motion.rows, part, positions, quaternions, count, even, motion.widths, motion.lever)
+    weights = motion.spline.weights(np.interp(knots.knots + 0.5 * whole, lengths, at)).values
+    new = weights @ motion.positions, weights @ motion.quaternions
+    return CurveMotion.through(motion.rows, knots, *new, motion.whitening, motion.lever)
 
 
 def _refine(
-    observations: Observations, deviations: Array, motion: CurveMotion, rounds: int, even: bool = True
+    observations: Observations, deviations: Array, motion: CurveMotion, rounds: int
 ) -> Solution[CurveMotion]:
     """Return the solution after rounds of projection onto the curve, steps of the solver and even knots."""
     while True:
@@ -516,7 +446,7 @@ def _refine(
         ends = float(used.min()), float(used.max())
         if not rounds or ends[1] - ends[0] < 1e-3 * motion.length:
             return solution
-        motion = _with_knots(solution.motion, motion.spline.count, even, ends)
+        motion = _with_knots(solution.motion, motion.spline.count, ends)
 
 
 def _nearest(observations: Observations, deviations: Array, motion: CurveMotion) -> Array:

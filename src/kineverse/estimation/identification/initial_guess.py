@@ -2,21 +2,27 @@
 
 from __future__ import annotations
 
+import functools
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from kineverse.lie import Array, inverse, log_so3, mean_rotation, rotation_along_z, transform, translation
 
-from .families import JOINT_FAMILIES, GroupMotion, JointFamily
-from .least_squares import InitialGuess
+from .families import JOINT_FAMILIES, VZ, WZ, GroupMotion, JointFamily
+from .least_squares import InitialGuess, Solution
+from .motion_model import FamilyMember
 from .observations import Observations
 
 ARC_RADII = (2.0, 8.0)
 """Radii of arcs that are tried, in standard deviations along the arc: 90° and 25° evenly observed."""
+
+# Directions of a half sphere that are tried as the axis of a cylinder, and cosine of the least angle between
+# those that are chosen.
+_DIRECTIONS, _APART = 100, math.cos(math.radians(25.0))
 
 
 class MotionStatistics:
@@ -49,11 +55,23 @@ class MotionStatistics:
         return [rotation for plane in self.planes for rotation in _find_rotations(self, *plane)]
 
     @cached_property
+    def cylinder_rotations(self) -> list[_AxisRotation]:
+        """Rotations about the axes of cylinders near the positions, further starts where no turn was seen."""
+        if self.rows == 6:
+            return []
+        planes = (
+            self._plane(rotation_along_z(axis)) for axis in _find_cylinder_axes(self.positions, self.spread)
+        )
+        return [next(_find_rotations(self, *plane)) for plane in planes]
+
+    @cached_property
     def planes(self) -> list[tuple[Array, Array]]:
         """Frames with a candidate axis as z axis, and positions relative to the mean in each."""
         axes = [_principal_directions(self.turns)[0]] if self.rows == 6 else []
-        frames = [rotation_along_z(axis) for axis in (*axes, self.spread[2])]
-        return [(frame, (self.positions - self.mean[:3, 3]) @ frame) for frame in frames]
+        return [self._plane(rotation_along_z(axis)) for axis in (*axes, self.spread[2])]
+
+    def _plane(self, frame: Array) -> tuple[Array, Array]:
+        return frame, (self.positions - self.mean[:3, 3]) @ frame
 
 
 def initial_guesses(name: str, statistics: MotionStatistics) -> Iterator[InitialGuess]:
@@ -85,12 +103,28 @@ def initial_guesses(name: str, statistics: MotionStatistics) -> Iterator[Initial
     elif name == "spherical":
         yield _guess_about_point(group, statistics)
     else:
-        for rotation in statistics.axis_rotations:
+        cylinders = statistics.cylinder_rotations if name != "revolute" else []
+        for rotation in (*statistics.axis_rotations, *cylinders):
             left, right, angles, along, slope = rotation
-            if name == "screw" and rows == 6 and (many := _guess_screw_revolutions(group, rotation)):
-                yield many
+            if name == "screw":
+                yield _guess_screw_revolutions(group, rows, rotation)
             values = angles[:, None] if name != "cylindrical" else np.column_stack([along, angles])
             yield InitialGuess(GroupMotion(group, rows, left, right, slope if group.pitch else 0.0), values)
+
+
+CONTAINED: Mapping[Any, tuple[str, ...]] = {"screw": ("revolute",), "cylindrical": ("prismatic", "screw")}
+"""Families that others contain, and from whose solutions these start as well."""
+
+
+def widened_guess(name: str, narrower: Solution[FamilyMember]) -> InitialGuess:
+    """Return the guess of a family that is a solution of a family that it contains."""
+    motion, group = narrower.motion, JOINT_FAMILIES[name]
+    assert isinstance(motion, GroupMotion)
+    twist = np.zeros((len(narrower.values), 6))
+    twist[:, motion.parametrisation.joints] = narrower.values
+    twist[:, VZ] += motion.pitch * twist[:, WZ]
+    wider = GroupMotion(group, motion.rows, motion.left, motion.right)
+    return InitialGuess(wider, twist[:, wider.parametrisation.joints])
 
 
 class _AxisRotation(NamedTuple):
@@ -106,7 +140,7 @@ class _AxisRotation(NamedTuple):
 def _find_rotations(statistics: MotionStatistics, frame: Array, places: Array) -> Iterator[_AxisRotation]:
     flat, along, centre = places[:, :2], places[:, 2], statistics.mean[:3, 3]
     if statistics.rows == 6:
-        angles = statistics.turns @ frame[:, 2]
+        angles = _cut(statistics.turns @ frame[:, 2])
         for place in (_fit_centre(flat), _fit_pivot(flat, angles)):
             left = transform(frame, centre + frame[:, :2] @ place)
             yield _AxisRotation(left, inverse(left) @ statistics.mean, angles, along, _slope(angles, along))
@@ -127,8 +161,17 @@ def _find_rotations(statistics: MotionStatistics, frame: Array, places: Array) -
         x, y = (lever @ turned).T
         left = transform(np.column_stack([frame[:, :2] @ turned, frame[:, 2]]), centre + frame[:, :2] @ place)
         right = transform(np.eye(3), np.array([float(np.mean(np.hypot(x, y))), 0.0, 0.0]))
-        angles = np.arctan2(y, x)
+        angles = _cut(np.arctan2(y, x))
         yield _AxisRotation(left, right, angles, along, _slope(angles, along))
+
+
+def _cut(angles: Array) -> Array:
+    """Return angles up to whole revolutions, within the revolution that begins after their largest gap."""
+    increasing = np.sort(angles % math.tau)
+    gaps = np.diff(increasing, append=increasing[0] + math.tau)
+    first = increasing[(int(np.argmax(gaps)) + 1) % len(angles)]
+    cut = first + (angles - first) % math.tau
+    return np.asarray(cut - math.tau * round(float(cut.mean()) / math.tau))
 
 
 def _slope(angles: Array, along: Array) -> float:
@@ -137,20 +180,15 @@ def _slope(angles: Array, along: Array) -> float:
     return float(off @ along) / variance if variance > 0.0 else 0.0
 
 
-def _guess_screw_revolutions(group: JointFamily, rotation: _AxisRotation) -> InitialGuess | None:
-    """Return a screw whose revolutions are counted along its displacement, or None for less than one."""
+def _guess_screw_revolutions(group: JointFamily, rows: int, rotation: _AxisRotation) -> InitialGuess:
+    """Return a screw whose revolutions are counted along its displacement."""
     order = np.argsort(rotation.along, kind="stable")
-    angles = rotation.angles[order]
-    if np.abs(np.diff(angles)).max() <= math.pi:
-        return None
-    unwrapped = np.empty_like(angles)
-    unwrapped[order] = np.unwrap(angles)
-    if np.ptp(unwrapped) <= math.tau:
-        return None
-    slope, offset = np.polyfit(unwrapped, rotation.along, 1)
+    unwrapped = np.empty_like(rotation.angles)
+    unwrapped[order] = np.unwrap(rotation.angles[order])
+    slope = _slope(unwrapped, rotation.along)
     right = rotation.right.copy()
-    right[2, 3] += offset
-    return InitialGuess(GroupMotion(group, 6, rotation.left, right, float(slope)), unwrapped[:, None])
+    right[2, 3] += float(np.mean(rotation.along)) - slope * float(np.mean(unwrapped))
+    return InitialGuess(GroupMotion(group, rows, rotation.left, right, slope), unwrapped[:, None])
 
 
 def _guess_about_point(group: JointFamily, statistics: MotionStatistics) -> InitialGuess:
@@ -186,6 +224,42 @@ def _fit_centre(points: Array) -> Array:
     # Points on a line have no centre. The scale and the regularisation bound it by some hundred extents.
     matrix = np.column_stack([2.0 * scaled, np.ones(len(points))])
     return _solve_ridge(matrix, np.sum(scaled**2, axis=1))[:-1] * size
+
+
+def _find_cylinder_axes(points: Array, principal: Array) -> Array:
+    """Return the axes (3, 3) of the best cylinders through points, each at a distance from the others.
+
+    The projection along the axis is a circle, whose algebraic fit is linear (Eberly, "Fitting 3D Data with a
+    Cylinder"). So the axis is searched among the principal directions, as the rows of a matrix, and a grid.
+    """
+    frames = np.concatenate([_half_sphere(), [rotation_along_z(axis) for axis in principal]])
+    axes, centred = frames[:, :, 2], points - points.mean(axis=0)
+    flat = centred / (math.sqrt(float(np.mean(centred**2))) or 1.0) @ frames[:, :, :2]
+    matrix = np.concatenate([2.0 * flat, np.ones((*flat.shape[:2], 1))], axis=2)
+    squares = np.sum(flat**2, axis=2)
+    right = np.einsum("mni,mn->mi", matrix, squares)
+    circles = np.linalg.solve(np.swapaxes(matrix, 1, 2) @ matrix + 1e-6 * np.eye(3), right[:, :, None])[
+        ..., 0
+    ]
+    # The algebraic residual is 2 r times the distance from a circle of radius r.
+    radii = np.sum(circles[:, :2] ** 2, axis=1) + circles[:, 2]
+    errors = np.sum((squares - np.einsum("mni,mi->mn", matrix, circles)) ** 2, axis=1) / np.maximum(
+        radii, 1e-9
+    )
+    chosen: list[int] = []
+    for _ in range(3):
+        chosen.append(int(np.argmin(errors)))
+        errors[np.abs(axes @ axes[chosen[-1]]) > _APART] = np.inf
+    return np.asarray(axes[chosen])
+
+
+@functools.cache
+def _half_sphere() -> Array:
+    """Return frames (M, 3, 3) whose z axes are evenly distributed over half a sphere."""
+    z = (np.arange(_DIRECTIONS) + 0.5) / _DIRECTIONS
+    spiral, radius = math.pi * (1.0 + math.sqrt(5.0)) * np.arange(_DIRECTIONS), np.sqrt(1.0 - z**2)
+    axes = np.column_stack([radius * np.cos(spiral), radius * np.sin(spiral), z])
+    return np.stack([rotation_along_z(axis) for axis in axes])
 
 
 def _fit_pivot(flat: Array, angles: Array) -> Array:

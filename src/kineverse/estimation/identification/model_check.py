@@ -24,10 +24,10 @@ import numpy as np
 from kineverse.errors import InvalidValueError
 from kineverse.lie import Array
 
-from .curve import CURVE, FEWEST_POSES, continue_curve, fit_curve, may_be_curve, stated_log_evidence
+from .curve import CURVE, FEWEST_POSES, continue_curve, fit_curve, may_be_curve
 from .families import FamilyMotion
 from .least_squares import Solution
-from .marginal_likelihood import Scored
+from .marginal_likelihood import Scored, laplace_evidence
 from .model_selection import (
     SAME_RATIO,
     FamilyName,
@@ -50,8 +50,8 @@ from .noise_estimation import (
     scale_noise,
 )
 from .observations import Observations
-from .outlier_rejection import RowIndices, densest_half, log_inlier_prior
-from .result import SURE, Fit, IdentificationResult, LazyFit, classify_inliers, project_observations
+from .outlier_rejection import RowIndices, classify_inliers, densest_half, log_inlier_prior
+from .result import SURE, Fit, IdentificationResult, LazyFit, project_observations
 from .solver import solver
 
 REFUTED = 1e-3  # largest probability of χ² at which the noise is refuted
@@ -78,6 +78,9 @@ _FITTING, _FITTING_FACTOR, _COMPETITIVE = 1e-3, 1.3, 1e-6
 _FEW, _SMOOTH = 20, math.cos(math.radians(45.0))
 # Probability of slow residuals, and their share in χ², that refute a joint of unknown noise.
 _SYSTEMATIC, _SYSTEMATIC_SHARE = 1e-3, 0.7
+# Sizes of an unknown noise relative to its medians above which it may be motion, for joints with one value
+# and with several.
+_LARGE, _STRANGE = 10.0, 4.0
 _ROUNDS = 3  # largest number of classifications of outliers
 
 
@@ -117,7 +120,7 @@ def weigh_and_check(
                     return compare(factor, solution.motion.name), curve
                 family = solutions[other].scored.solution.motion.name
                 reason = f"with {factor:.1f} times the stated noise it would be {family}"
-    result = replace(result, reason=reason or next(_reasons(data, result, solutions), ""))
+    result = replace(result, reason=reason or next(_reasons(data, result, solutions, weights), ""))
     if CURVE not in result.probabilities and CURVE in weights and may_be_curve(data.observations):
         later = LazyFit(CURVE, 0.0, partial(fit_of_curve, data, solutions, weights))
         result = replace(result, lazy_fits=(*result.lazy_fits, later))
@@ -141,9 +144,6 @@ def solve_curve(
     """Return the most probable curve by its inliers; None if there are too few for one, or equal."""
     observations, count = data.observations, len(data.observations)
     everything = np.arange(count)
-    # Only an evidence by the same observations is comparable.
-    comparable = [one for one in solutions.values() if len(one.inliers) == count]
-    competitor = max((one.log_evidence for one in comparable), default=-math.inf)
 
     def solve(rows: RowIndices) -> NoiseSolution | None:
         some = observations if len(rows) == count else observations.select(rows)
@@ -156,7 +156,7 @@ def solve_curve(
             return adapt_noise(some, NoiseSolution(before.scored, before.noise), continue_curve)
         others = [one.scored.solution for one in solutions.values() if np.array_equal(one.inliers, rows)]
         orders = [other.values[:, 0] for other in others if other.motion.joints == 1]
-        return _fit_to_noise(data, some, orders, competitor)
+        return _fit_to_noise(data, some, orders)
 
     solution = solve(everything)
     if solution is None:
@@ -186,23 +186,21 @@ def solve_curve(
 
 
 def _fit_to_noise(
-    data: IdentificationData, observations: Observations, orders: Sequence[Array], competitor: float
+    data: IdentificationData, observations: Observations, orders: Sequence[Array]
 ) -> NoiseSolution:
     latest: NoisePosterior | None = None
 
     def log_evidence(solution: Solution[FamilyMember]) -> float:
         nonlocal latest
         if data.stated:
-            return stated_log_evidence(solution)
+            return laplace_evidence(solution).log_evidence
         estimated = estimate_noise(observations, solution, latest)
         latest = estimated.noise
         return estimated.log_evidence
 
     def fit(some: Observations) -> Scored:
         free = solve_families(some, ["free"])["free"].solution
-        fitted = fit_curve(some, free.covariance, orders, log_evidence, competitor)
-        assert fitted is not None  # there are enough observations
-        return fitted
+        return fit_curve(some, free.covariance, orders, log_evidence)
 
     if data.stated:
         return NoiseSolution(fit(observations), STATED_NOISE)
@@ -249,13 +247,17 @@ def _compare_refuted(
 
 
 def _reasons(
-    data: IdentificationData, result: IdentificationResult, solutions: FamilySolutions
+    data: IdentificationData,
+    result: IdentificationResult,
+    solutions: FamilySolutions,
+    weights: FamilyWeights,
 ) -> Iterator[str]:
     name = _best_name(result, solutions)
     if result.lazy_fits[0].probability < SURE:
         return
     solution = solutions[name].scored.solution
     joints, curve = solution.motion.joints, solutions.get(CURVE)
+    yield from _unjustified(data, result, solutions, weights)
     covariance = solution.covariance
     if name == CURVE:
         along = np.sort(solution.values[:, 0])
@@ -280,6 +282,28 @@ def _reasons(
         fit = measure_fit(solution, observation_weight=data.observation_weight)
         if fit.slow_p_value < _SYSTEMATIC and fit.slow_share > _SYSTEMATIC_SHARE:
             yield "its residuals depend on the joint value, so this may be none of these joints"
+
+
+def _unjustified(
+    data: IdentificationData,
+    result: IdentificationResult,
+    solutions: FamilySolutions,
+    weights: FamilyWeights,
+) -> Iterator[str]:
+    """Yield reasons why the best family is probable by its prior or a strange noise, not by the data."""
+    name = _best_name(result, solutions)
+    motion, (size, turn) = solutions[name].scored.solution.motion, solutions[name].noise.factors
+    if not data.stated and max(size, turn) > (_STRANGE if motion.joints > 1 else _LARGE):
+        yield "the noise would be very large, so it may be a motion: state the noise"
+    # From positions a tilt of the axis may stand for a pitch, so they have to exclude others by themselves.
+    odds, rivals = SURE / (1.0 - SURE), result.probabilities.keys() - {motion.name}
+    if motion.rows == 6:
+        odds, rivals = 1.0, rivals & {"screw", "cylindrical", "free"}
+    prior = {one.scored.solution.motion.name: weights[name] for name, one in solutions.items()}
+    evidence = {family: p / prior[family] for family, p in result.probabilities.items()}
+    for rival in sorted(rivals, key=evidence.__getitem__, reverse=True)[:1]:
+        if evidence[motion.name] < odds * evidence[rival]:
+            yield f"{rival} explains the observations as well, and is only rarer"
 
 
 def _is_explained(curve: FamilySolution, solutions: FamilySolutions) -> bool:
@@ -327,16 +351,12 @@ def _best_name(result: IdentificationResult, solutions: FamilySolutions) -> Fami
 
 def _classify(data: IdentificationData, one: NoiseSolution) -> RowIndices:
     assert data.outliers is not None
-    rows, solution = data.observations.rows, one.scored.solution
+    solution = one.scored.solution
     observations = scale_noise(data.observations, one.noise.factors)
     projected = project_observations(solution.motion, solution.values, observations)
-    covariance = projected.covariance
-    if not data.stated:
-        # The median of χ² is about its degrees of freedom less 2/3, and half of the observations are inliers.
-        weighted = np.linalg.solve(covariance, projected.residuals[:, :, None])[:, :, 0]
-        median = float(np.median(np.sum(projected.residuals * weighted, axis=1)))
-        covariance = covariance * max(median / (rows - 1 - 2.0 / 3.0), 1e-12)
-    return np.flatnonzero(classify_inliers(projected.residuals, covariance, data.outliers, data.stated))
+    freedom = observations.rows - 1
+    known = projected.residuals, projected.covariance, data.outliers, data.stated, freedom
+    return np.flatnonzero(classify_inliers(*known))
 
 
 def fit_of_curve(

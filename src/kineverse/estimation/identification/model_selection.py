@@ -12,6 +12,7 @@ and ν their number less those of joint values and of determined parameters. If 
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
@@ -22,13 +23,18 @@ import numpy as np
 
 from kineverse.estimation.linear_algebra import invert_matrices, multiply_vectors
 from kineverse.estimation.noise import Outliers
-from kineverse.lie import Array
+from kineverse.lie import Array, transform
 
 from .families import REACH, Family, GroupMotion, family_starts
-from .initial_guess import MotionStatistics, initial_guesses
-from .joint_values import LITTLE, log_unwrapping_gain, unwrap_screw, unwrap_solution
+from .initial_guess import CONTAINED, MotionStatistics, initial_guesses, widened_guess
+from .joint_values import (
+    LITTLE,
+    log_unwrapping_gain,
+    unwrap_screw,
+    unwrap_solution,
+)
 from .least_squares import InitialGuess, Solution
-from .marginal_likelihood import Scored
+from .marginal_likelihood import Scored, laplace_evidence
 from .motion_model import FamilyMember
 from .noise_estimation import (
     STATED_NOISE,
@@ -159,6 +165,57 @@ def log_probability_straight(line: Solution[FamilyMember]) -> float:
     return -0.5 - 0.5 / (REACH * curvature) ** 2
 
 
+def log_principal_widths_gain(solution: Solution[FamilyMember], weight: float = 1.0) -> float:
+    """Return the gain in log evidence if each principal direction of joint values has its own width.
+
+    Half of the motions in a plane, about a point or in space have one width for all directions. The others
+    have principal directions, evenly distributed, with a width each. A direction without a motion beyond the
+    noise is none of them: that is a joint with fewer joint values.
+    """
+    motion = solution.motion
+    if not isinstance(motion, GroupMotion) or motion.joints == len(set(motion.kinds)):
+        return 0.0
+    known, parts = solver.evidence(solution, weight), []
+    for kind in sorted(set(motion.kinds)):
+        block = np.array(motion.kinds) == kind
+        centred = solution.values[:, block] - solution.values[:, block].mean(axis=0)
+        parts.append(np.linalg.eigh(centred.T @ centred))
+        noise = known.joint_covariances[:, block][:, :, block].sum(axis=0)
+        squares, directions = parts[-1]
+        if (squares < _USED**2 * np.einsum("ji,jk,ki->i", directions, noise, directions)).any():
+            return 0.0
+    # A common frame has the principal directions of translations, or of rotations if there are no others.
+    (squares, directions), turn, log_directions = parts[0], np.eye(3), 0.0
+    axes = [joint % 3 for joint in motion.parametrisation.joints[: len(squares)]]
+    turn[np.ix_(axes, axes)] = directions
+    turn[:, axes[0]] *= np.linalg.det(turn)
+    for one, other in itertools.combinations(np.maximum(squares, 1e-12), 2):
+        information = weight * len(solution.values) * (math.sqrt(one / other) - math.sqrt(other / one)) ** 2
+        # Principal directions have no order, so each of their angles is within a quarter of a revolution.
+        angle = math.log(math.pi / 2) + 0.5 * math.log(max(information, 1e-9) / math.tau)
+        log_directions -= max(0.0, angle)
+    change, twist = transform(turn, np.zeros(3)), np.zeros((len(solution.values), 6))
+    twist[:, motion.parametrisation.joints] = solution.values
+    values = np.concatenate([twist[:, :3] @ turn, twist[:, 3:] @ turn], axis=1)
+    turned = _PrincipalMotion(motion.group, motion.rows, motion.left @ change, change.T @ motion.right)
+    values = values[:, motion.parametrisation.joints]
+    other = replace(solution, motion=turned, values=values, linear=turned.linearise(values))
+    gain = laplace_evidence(other, weight).log_evidence - known.log_evidence
+    return float(np.logaddexp(0.0, gain + log_directions)) - math.log(2.0)
+
+
+class _PrincipalMotion(GroupMotion):
+    """Motion along principal directions, in which each joint value has its own width."""
+
+    __slots__ = ()
+
+    @property
+    def kinds(self) -> tuple[int, ...]:
+        return tuple(range(self.joints))
+
+
+# Least width of a motion along a principal direction, in standard deviations of its joint values.
+_USED = 2.0
 # A family is not refined if its log evidence is below that of the best by more than a constant and a term for
 # each observation. With noise that is large compared with the motion, unrefined evidence is this inaccurate.
 _NEGLIGIBLE, _NEGLIGIBLE_EACH = 15.0, 0.5
@@ -247,17 +304,23 @@ def _classify(
 
 def _solve_inliers(data: IdentificationData, inliers: FamilyInliers) -> dict[FamilyName, NoiseSolution]:
     def solve(name: FamilyName, statistics: MotionStatistics, some: Observations) -> Scored:
-        scored = solver.maximum_likelihood(some, _starts(some, name, statistics, data.unit))
+        # A family is at least as probable by its fit as those that it contains.
+        narrower = [solutions[one].scored.solution for one in CONTAINED.get(name, ()) if one in solutions]
+        wider = [[widened_guess(str(name), one)] for one in narrower if len(one.values) == len(some)]
+        starts = [_starts(some, name, statistics, data.unit), *wider]
+        solved = (solver.maximum_likelihood(some, each) for each in starts)
+        scored = max(solved, key=lambda one: one.log_evidence)
         # A screw is solved again with the revolutions of the observations.
         start = unwrap_screw(some, scored.solution) if data.sequential else None
         return scored if start is None else solver.maximum_likelihood(some, [start])
 
     solver.prepare()
     solutions: dict[FamilyName, NoiseSolution] = {}
+    names = sorted(inliers, key=lambda name: name in CONTAINED)  # those that others contain come first
     for rows in {rows.tobytes(): rows for rows in inliers.values()}.values():
         observations = data.observations.select(rows)
         statistics = MotionStatistics(observations)
-        for name in (name for name, others in inliers.items() if np.array_equal(others, rows)):
+        for name in (name for name in names if np.array_equal(inliers[name], rows)):
             if data.stated:
                 solutions[name] = NoiseSolution(solve(name, statistics, observations), STATED_NOISE)
             else:
@@ -278,13 +341,14 @@ def score_solutions(
     for name, one in solutions.items():
         if data.outliers is not None:
             used = len(inliers[name])
-            log_priors[name] = log_inlier_prior(data.outliers, count, used, data.observations.rows)
+            log_priors[name] += log_inlier_prior(data.outliers, count, used, data.observations.rows)
         if data.sequential:
             log_priors[name] += log_unwrapping_gain(one.scored.solution)
     # The threshold is on evidence in which each observation has its weight.
     weight, logs, result = data.observation_weight, {}, {}
     for name, one in solutions.items():
         logs[name] = one.log_evidence + math.log(weights[name]) / weight + log_priors[name]
+        logs[name] += log_principal_widths_gain(one.scored.solution, weight) / weight
     threshold = max(logs.values()) - _NEGLIGIBLE / weight
     threshold -= _NEGLIGIBLE_EACH * max(map(len, inliers.values()))
     refine = adapt_noise if renew and not data.stated else _integrate_joint_values
@@ -292,7 +356,8 @@ def score_solutions(
         if logs[name] >= threshold:
             rows = inliers[name]
             one = refine(data.observations if len(rows) == count else data.observations.select(rows), one)
-        result[name] = FamilySolution(*one, inliers[name], count, log_priors[name])
+        log_prior = log_priors[name] + log_principal_widths_gain(one.scored.solution, weight) / weight
+        result[name] = FamilySolution(*one, inliers[name], count, log_prior)
     return result
 
 

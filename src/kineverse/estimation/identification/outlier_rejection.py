@@ -122,6 +122,34 @@ def log_inlier_prior(outliers: Outliers, count: int, inliers: int, rows: int) ->
     return inliers * math.log(1.0 - outliers.fraction) + log_outliers
 
 
+def classify_inliers(
+    residuals: Array,
+    covariance: Array,
+    outliers: Outliers,
+    stated: bool,
+    freedom: int = 0,
+) -> npt.NDArray[np.bool_]:
+    """Return the mask of inliers for residuals (N, m) with covariances (N, m, m), see :func:`_whiten`."""
+    return is_inlier(*_whiten(residuals, covariance, stated, freedom), outliers, residuals.shape[1])
+
+
+def _whiten(residuals: Array, covariance: Array, stated: bool, freedom: int) -> tuple[Array, Array]:
+    """Return squared norms of the whitened residuals, and ½ log |2πS|, (N,).
+
+    A noise that is not stated may vary between observations. With the degrees of freedom of a residual, its
+    size is that of the median residual.
+    """
+    rows = residuals.shape[1]
+    squares = np.einsum("ni,nij,nj->n", residuals, invert_matrices(covariance), residuals)
+    log_scale = 0.5 * np.linalg.slogdet(math.tau * covariance)[1]
+    if stated:
+        return squares, log_scale
+    # The median of χ² is about its degrees of freedom less 2/3, and half of the observations are inliers.
+    size = float(np.median(squares)) / (freedom - 2.0 / 3.0) if freedom else 1.0
+    size = max(UNEVEN**2 * size, 1e-12)
+    return squares / size, log_scale + 0.5 * rows * math.log(size)
+
+
 def is_inlier(squares: Array, log_scale: Array, outliers: Outliers, rows: int = 6) -> npt.NDArray[np.bool_]:
     """Return the mask of observations that are more probable as inliers than as outliers."""
     log_inlier = math.log(1.0 - outliers.fraction) - 0.5 * squares - log_scale
@@ -204,12 +232,5 @@ class _InlierSearch:
         covariance = solution.covariance
         if weights is not None:
             covariance = covariance * weights[:, None, None]
-        residuals, motion, rows = solution.residuals, solution.motion, self.observations.rows
-        squares = np.einsum("ni,nij,nj->n", residuals, invert_matrices(covariance), residuals)
-        log_scale = 0.5 * np.linalg.slogdet(math.tau * covariance)[1]
-        if self.stated or motion.joints == rows:
-            return squares, log_scale
-        # The median of χ² is about its degrees of freedom less 2/3, and half of the observations are inliers.
-        size = float(np.median(squares)) / (rows - motion.joints - 2.0 / 3.0)
-        size = max(UNEVEN**2 * size, 1e-12)
-        return squares / size, log_scale + 0.5 * rows * math.log(size)
+        freedom = self.observations.rows - solution.motion.joints
+        return _whiten(solution.residuals, covariance, self.stated or not freedom, freedom)

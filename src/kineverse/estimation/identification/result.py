@@ -24,7 +24,7 @@ from .least_squares import Solution, levenberg_marquardt
 from .marginal_likelihood import Evidence
 from .motion_model import FamilyMember, FixedMotion, MotionModel
 from .observations import Observations
-from .outlier_rejection import UNEVEN, is_inlier
+from .outlier_rejection import classify_inliers
 
 SURE = 0.95  # least probability at which the best family is reported as identified
 
@@ -278,7 +278,7 @@ _WELL_KNOWN = math.radians(20.0)  # largest standard deviation of a direction th
 def build_fit(solution: Solution[FamilyMember], known: Evidence, log: float, probability: float) -> Fit:
     """Return the fit of a family from its solution and evidence."""
     motion, covariance, values, covariances = slide_child_origin(
-        solution.motion, known.covariance.copy(), known.joint_values, known.joint_covariances
+        solution.motion, known.covariance.copy(), known.joint_values, _joint_covariances(solution, known)
     )
     names = motion.coordinates()
     if "pitch" in names and isinstance(motion, GroupMotion):
@@ -301,6 +301,19 @@ def build_fit(solution: Solution[FamilyMember], known: Evidence, log: float, pro
         rows=solution.residuals.shape[1],
         motion=motion,
     )
+
+
+def _joint_covariances(solution: Solution[FamilyMember], known: Evidence) -> Array:
+    """Return the covariances of the joint values (N, k, k), those of the parameters included.
+
+    The zero of a joint along a fixed axis is the mean of its values, so a common change of all is none.
+    """
+    linear = solution.linear
+    weighted = np.swapaxes(linear.by_joints, 1, 2) @ invert_matrices(solution.covariance)
+    by_parameters = known.joint_covariances @ weighted @ linear.by_parameters
+    if isinstance(solution.motion, GroupMotion) and solution.motion.name not in ("spherical", "free"):
+        by_parameters = by_parameters - by_parameters.mean(axis=0)
+    return known.joint_covariances + by_parameters @ known.covariance @ np.swapaxes(by_parameters, 1, 2)
 
 
 def _undetermined_reason(solution: Solution[FamilyMember], names: tuple[str, ...], covariance: Array) -> str:
@@ -367,14 +380,3 @@ def complete_fit(
         residuals=merge(fit.residuals, solution.residuals),
         outliers=tuple(np.union1d(used[list(fit.outliers)], rejected).tolist()),
     )
-
-
-def classify_inliers(
-    residuals: Array, covariance: Array, outliers: Outliers, stated: bool
-) -> npt.NDArray[np.bool_]:
-    """Return the mask of inliers for residuals (N, m) with covariances (N, m, m), stated or estimated."""
-    if not stated:
-        covariance = UNEVEN**2 * covariance
-    squares = np.einsum("ni,nij,nj->n", residuals, invert_matrices(covariance), residuals)
-    log_scale = 0.5 * np.linalg.slogdet(math.tau * covariance)[1]
-    return is_inlier(squares, log_scale, outliers, residuals.shape[1])

@@ -26,7 +26,7 @@ from kineverse.estimation.identification.kinematic_graph.pairwise import (
 )
 from kineverse.estimation.identification.observations import Observations
 from kineverse.estimation.identification.outlier_rejection import RowIndices, is_inlier
-from kineverse.estimation.identification.result import SURE, IdentificationResult, project_observations
+from kineverse.estimation.identification.result import SURE, Fit, IdentificationResult, project_observations
 from kineverse.estimation.linear_algebra import (
     invert_matrices,
     log_determinants,
@@ -38,9 +38,17 @@ from kineverse.lie import Array
 from kineverse.model.model import Model
 from kineverse.model.operation import Operation
 
+from .consistency import TimedResiduals
 from .replacement import build_replacement, extend_fit, follows_another
 from .report import JointVerdict, TestableJoint
-from .residuals import SIZES, KnownJoint, KnownResiduals, compute_residuals, orthogonal_residuals
+from .residuals import (
+    SIZES,
+    KnownJoint,
+    KnownResiduals,
+    compute_residuals,
+    displacement_jacobian,
+    orthogonal_residuals,
+)
 
 
 def reject_outliers(residuals: KnownResiduals, outliers: Outliers | None) -> RowIndices:
@@ -162,21 +170,19 @@ _ALMOST_ONE = 1.1  # factor on covariances that changes no verdict
 
 
 @dataclass(frozen=True)
-class JointObservations:
+class JointObservations(TimedResiduals):
     """Observations of a tested joint."""
 
     joint: TestableJoint
     served: KnownJoint  # motion in the served model
     observations: Observations  # of both frames
-    residuals: KnownResiduals
-    times: npt.NDArray[np.int_]  # numbers of the observations, (N,)
     stamps: Array  # their times [s], (N,)
 
     def select(self, rows: slice | npt.NDArray[np.int_]) -> JointObservations:
         """Return some of the observations."""
         poses, residuals = self.observations.select(rows), self.residuals.select(rows)
         times, stamps = self.times[rows], self.stamps[rows]
-        return JointObservations(self.joint, self.served, poses, residuals, times, stamps)
+        return replace(self, times=times, stamps=stamps, observations=poses, residuals=residuals)
 
     def decorrelate(self, looks: float) -> JointObservations:
         """Return evenly spaced observations with larger covariances, as independent ones."""
@@ -240,6 +246,15 @@ def judge_joint(
     left_out = tuple(np.setdiff1d(recent.times, inliers.times).tolist())
     verdict = JointVerdict(data.joint, probabilities, rms, len(data.times), implausible_since, alternative)
     return replace(verdict, replacement=operation, reason=reason, outliers=left_out)
+
+
+def displacement_covariance(fit: Fit, middle: Array) -> Array:
+    """Return the covariance of the displacements of a joint and its child (12, 12) by that of a fit."""
+    linear = fit.motion.linearise(fit.joint_values)
+    places = displacement_jacobian(linear.pose, middle).reshape(-1, 12)
+    scale = np.array([1.0 / math.tau if name == "pitch" else 1.0 for name in fit.coordinates])
+    moved = np.linalg.lstsq(places, linear.by_parameters.reshape(len(places), -1) * scale)[0]
+    return np.asarray(moved @ fit.covariance @ moved.T)
 
 
 def _probabilities(data: JointObservations, alternative: IdentificationResult | None) -> dict[str, float]:

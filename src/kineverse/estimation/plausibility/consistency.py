@@ -12,13 +12,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 
 import numpy as np
 import numpy.typing as npt
 
 from kineverse.compilation import compile
 from kineverse.errors import KineverseError
+from kineverse.estimation.identification.observations import PoseTrack, pair_tracks
 from kineverse.estimation.linear_algebra import multiply_vectors
+from kineverse.estimation.noise import CHI_SQUARED_6
 from kineverse.expressions.expression import Expression, array, as_expression
 from kineverse.lie import Array, pose_difference
 from kineverse.model.model import Model
@@ -27,7 +30,7 @@ from kineverse.model.rates import to_plain
 from kineverse.symbols import Symbol
 
 from .report import TestableJoint
-from .residuals import KnownJoint, KnownResiduals, is_own_limit
+from .residuals import KnownJoint, KnownResiduals, compute_residuals, is_own_limit
 
 # Range of the linearity test in standard deviations, and the accepted relative nonlinearity.
 _RANGE, _NONLINEAR = 2.0, 0.5
@@ -39,6 +42,41 @@ class TimedResiduals:
 
     times: npt.NDArray[np.int_]  # numbers of the observations, (N,)
     residuals: KnownResiduals
+
+
+_COMPARED = 50  # number of observations by which exchanged frames are recognised
+
+
+def find_exchanged_frames(
+    rejected: Mapping[TestableJoint, int],
+    served_joints: Mapping[TestableJoint, KnownJoint],
+    tracks: Mapping[str, PoseTrack],
+    exact: str | None,
+) -> dict[TestableJoint, str]:
+    """Return the joints rejected since some row that fit once two frames are exchanged, with the reason."""
+    since = min(rejected.values(), default=0)
+
+    def fits(joint: TestableJoint, tracks: Mapping[str, PoseTrack]) -> bool:
+        parent, child = tracks[joint.parent], tracks[joint.child]
+        rows = np.flatnonzero(parent.observed & child.observed)
+        rows = rows[rows >= since][:_COMPARED]
+        if not len(rows):
+            return False
+        residuals = compute_residuals(served_joints[joint], pair_tracks(parent, child, rows))
+        return float(np.median(np.sum(residuals.orthogonal**2, axis=1))) < CHI_SQUARED_6
+
+    known = [joint for joint in served_joints if {joint.parent, joint.child} <= tracks.keys()]
+    frames = dict.fromkeys(f for joint in rejected for f in (joint.parent, joint.child) if f != exact)
+    for a, b in combinations(frames, 2):
+        exchanged = {**tracks, a: tracks[b], b: tracks[a]}
+        involved = [joint for joint in known if {joint.parent, joint.child} & {a, b}]
+        if not any(fits(joint, tracks) for joint in involved):
+            if all(fits(joint, exchanged) for joint in involved):
+                reason = (
+                    f"the poses of '{a}' and '{b}' seem to be exchanged: with each other's the joint fits"
+                )
+                return dict.fromkeys([joint for joint in involved if joint in rejected], reason)
+    return {}
 
 
 class ConsistencyTests:

@@ -7,6 +7,10 @@ If the joint is as served, ρ of each observation is standard normal. The altern
 - joint values exceed their limits, or contradict other estimates, by z standard deviations: the gain
   exp(λ z - λ²/2) has the mean 1 at a limit, and less inside.
 
+A joint that was identified is known up to a displacement δ ~ N(0, Σ) with the covariance of its fit. Then the
+density of the served joint is the mixture over δ, and a displaced joint begins with what is known of δ. The
+bound holds on average over δ.
+
 Each alternative may begin at any observation j, with the prior weight 1/(j (j+1)). M is the ratio of the
 density of all observations under the mixture of alternatives to that under the served joint. If the joint is
 as served, M is a supermartingale that begins at 1, for any joint values. By Ville's inequality, the
@@ -20,7 +24,8 @@ alternative by one observation is cut off at some c. For any distribution of the
 
 and min(L, c) divided by this bound is a fair bet again (Huber's censored ratio). A small c costs little per
 observation and detects small deviations slowly; a large c detects gross ones at once. The capital is split
-among several c.
+among several c. ε is the share of gross errors so far, between the stated one and four times as much. It
+begins at the largest.
 
 If errors are correlated and m observations are worth an independent one, see
 :mod:`kineverse.estimation.correlation`, L is replaced by L^(1/m). By Hölder's inequality E[Π L_i^(1/m)] <= Π
@@ -47,17 +52,22 @@ _SLOPES = np.array([2.0, 5.0])
 # Fraction of the capital bet on each observation: against a permanent and an occasional deviation.
 _STAKES = np.array([1.0 - 1e-9, 0.1])
 _CUTS = np.array([1.1, 1.5, 4.0, 20.0])  # upper bounds on the gain by one observation, if there are outliers
+# Largest share of outliers relative to the stated one, the number of observations that it is worth at the
+# beginning, and the number after which the past is forgotten.
+_MOST, _AT_FIRST, _MEMORY = 4.0, 5.0, 1000.0
+_GROSS = 64.0  # square of a residual from which on it counts as an outlier: eight standard deviations
 # Number of change points of a displacement, and of the newest ones, which have little evidence yet. Dropping
 # some only reduces M.
 _CHANGE_POINTS, _NEWEST = 6, 2
-_SIZES = np.array(SIZES)
 _LEAST_WEIGHT = 0.1  # least weight of a tested observation, in independent ones
 
 
 class SequentialTest:
-    """Sequential test of one joint."""
+    """Sequential test of one joint, which may be known up to a displacement with a covariance (12, 12)."""
 
-    def __init__(self, false_alarms: float, outlier_fraction: float = 0.0) -> None:
+    def __init__(
+        self, false_alarms: float, outlier_fraction: float = 0.0, displacement: Array | None = None
+    ) -> None:
         self._threshold = -math.log(false_alarms)
         self._bet = _CensoredBet(outlier_fraction)
         self.count = 0
@@ -65,9 +75,13 @@ class SequentialTest:
         self._time = 0.0
         self.implausible_since: int | None = None
         self.detected_at: int | None = None
-        self._displacement = _DisplacementTest(self._bet)
+        self._displacement = _DisplacementTest(self._bet, displacement)
         self._unconstrained = _ChangePoints(len(_DEVIATIONS), self._bet)
         self._beyond = _ChangePoints(0, self._bet)
+
+    def count_outlier(self, orthogonal: Array, displacement_jacobian: Array) -> None:
+        """Learn the share of outliers from an observation, also from one that is not added."""
+        self._bet.count(self._displacement.served_square(orthogonal, displacement_jacobian) > _GROSS)
 
     def add(
         self, orthogonal: Array, displacement_jacobian: Array, one_sided: Array, looks: float = 1.0
@@ -75,23 +89,23 @@ class SequentialTest:
         """Add one observation; return log M."""
         time = self._time + 1.0 / looks if self.count else 1.0
         weight = math.log((time - self._time) / ((1.0 + self._time) * (1.0 + time)))
-        self._time = time
+        self._time, index = time, self.count
         self.count += 1
-        if self.count == 1:
+        if index == 0:
             self._limited = np.logical_not(np.isneginf(one_sided))
             self._beyond = _ChangePoints(int(self._limited.sum()) * len(_SLOPES), self._bet)
         parts: list[tuple[float, float, int]] = []
         if len(orthogonal):
-            squares = float(orthogonal @ orthogonal)
-            index = self.count - 1
-            displaced = self._displacement.add(weight, index, orthogonal, displacement_jacobian, looks)
-            log = _HALF_SHRUNK * squares - len(orthogonal) * _LOG_GROWN
-            unconstrained = self._unconstrained.add(weight, self.count - 1, log / looks)
-            parts += [(0.5, *displaced), (0.3, *unconstrained)]
+            served, displaced, since = self._displacement.add(
+                weight, index, orthogonal, displacement_jacobian, looks
+            )
+            log = _HALF_SHRUNK * float(orthogonal @ orthogonal) - len(orthogonal) * _LOG_GROWN
+            unconstrained = self._unconstrained.add(weight, index, log / looks - served)
+            parts += [(0.5, displaced, since), (0.3, *unconstrained)]
         if self._limited.any():
             z = np.maximum(one_sided[self._limited], -1e3)
             log = np.nan_to_num(_SLOPES[:, None] * z - 0.5 * _SLOPES[:, None] ** 2, nan=0.0).ravel()
-            parts.append((0.2, *self._beyond.add(weight, self.count - 1, log / looks)))
+            parts.append((0.2, *self._beyond.add(weight, index, log / looks)))
         if not parts:
             return 0.0
         total = sum(p for p, _, _ in parts)
@@ -99,7 +113,7 @@ class SequentialTest:
         # The rest of the prior weight belongs to change points still to come.
         ratio = float(np.logaddexp.reduce([*logs, -math.log(1.0 + time)]))
         if self.implausible_since is None and ratio >= self._threshold:
-            self.detected_at = self.count - 1
+            self.detected_at = index
             self.implausible_since = parts[int(np.argmax(logs))][2]
         return ratio
 
@@ -107,11 +121,8 @@ class SequentialTest:
 class CorrelatedTest:
     """Sequential test of one joint that skips correlated observations; others have the weight of all."""
 
-    def __init__(
-        self, false_alarms: float, outlier_fraction: float, correlation: CorrelationSettings
-    ) -> None:
-        self._test = SequentialTest(false_alarms, outlier_fraction)
-        self._correlation = ErrorCorrelation(correlation)
+    def __init__(self, test: SequentialTest, correlation: CorrelationSettings) -> None:
+        self._test, self._correlation = test, ErrorCorrelation(correlation)
         self._numbers: list[int] = []
         self._owed = 0.0
 
@@ -125,31 +136,41 @@ class CorrelatedTest:
         """Add one observation with its number at a time; after a rejection nothing changes."""
         if self._test.implausible_since is not None:
             return
-        orthogonal = residuals.orthogonal[0]
-        self._owed += 1.0 / self._correlation.add(residuals.whitened[0], len(orthogonal), at)
+        row = residuals.orthogonal[0], residuals.displacement_jacobian[0]
+        self._owed += 1.0 / self._correlation.add(residuals.whitened[0], len(row[0]), at)
         if self._owed >= _LEAST_WEIGHT:
             self._numbers.append(number)
-            looks = 1.0 / min(self._owed, 1.0)
-            self._test.add(orthogonal, residuals.displacement_jacobian[0], residuals.one_sided[0], looks)
+            self._test.add(*row, residuals.one_sided[0], 1.0 / min(self._owed, 1.0))
             self._owed = 0.0
+        self._test.count_outlier(*row)
 
 
 class _CensoredBet:
-    """Gain by one observation, censored for outliers."""
+    """Gain by one observation, censored for outliers, whose share is learned."""
 
     def __init__(self, outlier_fraction: float) -> None:
         self.robust = outlier_fraction > 0.0
-        self._cuts = np.log(_CUTS) if self.robust else np.array([np.inf])
-        self._price = np.log1p(outlier_fraction * (_CUTS - 1.0)) if self.robust else np.zeros(1)
+        self._least, self._most = outlier_fraction, min(_MOST * outlier_fraction, 1.0)
+        self._seen, self._outliers = _AT_FIRST, _AT_FIRST * self._most
+        self._limits = _CUTS if self.robust else np.array([np.inf])
+        self._cuts = np.log(self._limits)
         stakes = _STAKES if self.robust else np.ones(1)
         with np.errstate(divide="ignore"):
             self._kept, self._staked = np.log1p(-stakes), np.log(stakes)
         self.cuts = len(self._cuts)
         self.shape = len(stakes), self.cuts
 
+    def count(self, is_outlier: bool) -> None:
+        """Count an observation, and forget old ones."""
+        kept = 1.0 - 1.0 / _MEMORY
+        self._seen, self._outliers = kept * self._seen + 1.0, kept * self._outliers + is_outlier
+
     def gains(self, log: Array) -> Array:
         """Return the log gain for each cut, (..., cuts), of log density ratios."""
-        return np.asarray(np.minimum(log[..., None], self._cuts) - self._price)
+        if not self.robust:
+            return log[..., None]
+        share = min(max(self._outliers / self._seen, self._least), self._most)
+        return np.asarray(np.minimum(log[..., None], self._cuts) - np.log1p(share * (self._limits - 1.0)))
 
     def stake(self, log: Array) -> Array:
         """Return the log gain for each stake and cut, (..., stakes, cuts)."""
@@ -179,21 +200,30 @@ class _ChangePoints:
 
 
 class _DisplacementTest:
-    """Displacements δ ~ N(0, s² I) for several sizes s, each with several change points."""
+    """Kalman filters of displacements δ: of the served joint, and larger ones since several change points.
 
-    def __init__(self, bet: _CensoredBet) -> None:
+    A displacement that begins adds N(0, s² I), with several sizes s. The first filter is the served joint's.
+    """
+
+    def __init__(self, bet: _CensoredBet, served: Array | None) -> None:
         self._bet = bet
-        shape = _CHANGE_POINTS, len(SIZES)
         self._starts = np.full(_CHANGE_POINTS, -1)
-        self._logs = np.full((*shape, bet.cuts), -np.inf)
-        self._means = np.zeros((*shape, 12))
-        self._prior = np.square(_SIZES)[:, None, None] * np.eye(12)
-        self._covariances = np.tile(self._prior, (_CHANGE_POINTS, 1, 1, 1))
+        self._logs = np.full((_CHANGE_POINTS, len(SIZES), bet.cuts), -np.inf)
+        self._prior = np.square(SIZES)[:, None, None] * np.eye(12)
+        self._means = np.zeros((1 + _CHANGE_POINTS * len(SIZES), 12))
+        none = np.zeros((1, 12, 12)) if served is None else served[None]
+        self._covariances = np.concatenate([none, np.tile(self._prior, (_CHANGE_POINTS, 1, 1))])
+
+    def served_square(self, orthogonal: Array, displacement_jacobian: Array) -> float:
+        """Return the squared Mahalanobis norm of a residual under the served joint."""
+        error = orthogonal - displacement_jacobian @ self._means[0]
+        spread = displacement_jacobian @ self._covariances[0] @ displacement_jacobian.T
+        return float(error @ np.linalg.solve(spread + np.eye(len(error)), error))
 
     def add(
         self, weight: float, index: int, orthogonal: Array, displacement_jacobian: Array, looks: float
-    ) -> tuple[float, int]:
-        """Return the log of the mixture over sizes and change points, and the most likely change point."""
+    ) -> tuple[float, float, int]:
+        """Return the log density ratio of the served joint to an exact one, and as :class:`_ChangePoints`."""
         self._begin(weight, index)
         transposed = displacement_jacobian.T
         error = orthogonal - self._means @ transposed
@@ -201,23 +231,25 @@ class _DisplacementTest:
         spread = displacement_jacobian @ cross_covariance
         spread += looks * np.eye(len(orthogonal))
         information = np.linalg.inv(spread)
-        displaced = np.sum(error * (information @ error[..., None])[..., 0], axis=2)
+        squares = np.sum(error * (information @ error[..., None])[..., 0], axis=1)
         log_volume = np.linalg.slogdet(spread)[1] - len(orthogonal) * math.log(looks)
-        squares = float(orthogonal @ orthogonal)
-        self._logs += self._bet.gains(0.5 * (squares / looks - displaced - log_volume))
+        log = 0.5 * (float(orthogonal @ orthogonal) / looks - squares - log_volume)
+        self._logs += self._bet.gains((log[1:] - log[0]).reshape(_CHANGE_POINTS, -1))
         if self._bet.robust:
-            information *= (displaced <= CHI_SQUARED_6)[..., None, None]
+            information *= (squares <= CHI_SQUARED_6)[:, None, None]
         gain = cross_covariance @ information
         self._means += (gain @ error[..., None])[..., 0]
-        self._covariances -= gain @ np.swapaxes(cross_covariance, 2, 3)
+        self._covariances -= gain @ np.swapaxes(cross_covariance, 1, 2)
         highest = float(self._logs.max())
         total = float(np.exp(self._logs - highest).sum())
-        result = highest + math.log(total / (len(SIZES) * self._bet.cuts))
-        return result, int(self._starts[np.argmax(self._logs.max(axis=(1, 2)))])
+        mixture = highest + math.log(total / (len(SIZES) * self._bet.cuts))
+        return float(log[0]), mixture, int(self._starts[np.argmax(self._logs.max(axis=(1, 2)))])
 
     def _begin(self, weight: float, index: int) -> None:
         """Replace the least likely of the older change points by a new one."""
         leading = np.where(self._starts <= index - _NEWEST, self._logs.max(axis=(1, 2)), np.inf)
         slot = int(np.argmin(leading))
         self._starts[slot], self._logs[slot] = index, weight
-        self._means[slot], self._covariances[slot] = 0.0, self._prior
+        filters = slice(1 + slot * len(SIZES), 1 + (slot + 1) * len(SIZES))
+        self._means[filters] = self._means[0]
+        self._covariances[filters] = self._covariances[0] + self._prior

@@ -1,349 +1,304 @@
-"""Reader of pose tables (CSV and the like): columns, units, rows."""
+"""Reader of pose tables."""
 
 from __future__ import annotations
 
-import csv
 import math
 import os
-import re
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from datetime import UTC, datetime
 from pathlib import Path
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 
 from kineverse.errors import FormatError
-from kineverse.formats.files import read_file
 from kineverse.formats.xml_values import LARGEST
-from kineverse.lie import Array, exp_so3, quaternion, rpy, transform
+from kineverse.lie import Array, exp_so3, quaternion, rotation_angle, rpy, to_quaternion, transform
 
-from .recording import Indices, RecordedTrack, Recording
-
-POSITION = ("x", "y", "z")
-_RPY, _VECTOR = ("roll", "pitch", "yaw"), ("rx", "ry", "rz")
-ORIENTATIONS: Mapping[str, tuple[str, ...]] = MappingProxyType(
-    {"quaternion": ("qx", "qy", "qz", "qw"), "rpy": _RPY, "rotation vector": _VECTOR}
+from .columns import (
+    COLUMN_HELP,
+    UNITS,
+    UNNAMED_COLUMNS,
+    UNORDERED,
+    Columns,
+    PartColumns,
+    parse_columns,
 )
-"""Representations of an orientation, with their columns."""
+from .recording import Indices, RecordedTrack, Recording, spaced_indices
+from .table import Table, convert_frame, is_number, read_table
 
-TIME, PART, SKIP = "time", "part", "-"
-SYNONYMS: Mapping[str, str] = MappingProxyType(
-    dict.fromkeys(("t", "stamp", "timestamp"), TIME)
-    | dict.fromkeys(("name", "link", "body", "object", "frame", "child_frame_id"), PART)
-)
+ROOM, FARTHEST = 50.0, 1000.0
+"""Largest range of the positions of a part, and their largest coordinate, that are possible in a room [m]."""
 
-_LENGTHS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
-_ANGLES = {"rad": 1.0, "deg": math.pi / 180.0, "°": math.pi / 180.0}
-_TIMES = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
-UNITS: Mapping[str, Mapping[str, float]] = MappingProxyType(
-    {TIME: _TIMES} | dict.fromkeys(POSITION, _LENGTHS) | dict.fromkeys(_RPY + _VECTOR, _ANGLES)
-)
-"""Units of each quantity; the first is the default."""
-
-QUANTITIES = (TIME, PART, *POSITION, *(name for names in ORIENTATIONS.values() for name in names))
-UNNAMED_COLUMNS: Mapping[int, str] = MappingProxyType({3: "x,y,z", 7: "x,y,z,qx,qy,qz,qw"})
-"""Column names of a table without a head, by number of columns."""
-
-COLUMN_HELP = (
-    "Known are time, part, x, y, z, and qx, qy, qz, qw or roll, pitch, yaw or rx, ry, rz (a rotation "
-    "vector), with a unit as in 'x [mm]', and for several parts in a row a name before them, as in 'door.x'."
-)
-
-_WITH_UNIT = re.compile(r"(?P<name>.*?)\s*(?:[\[(]\s*(?P<unit>[^\[\]()]*?)\s*[\])])?")
+_DOUBTFUL = 10.0  # range of positions without a unit that may be metres or millimetres
+_INLYING = (0.05, 0.95)  # quantiles between which positions are no outliers
+_ROTATION_TOLERANCE = 0.01  # deviation of a quaternion's length from 1, and of a matrix from a rotation
+_DECISIVE = 1.5  # ratio of misfits that decides between two readings of an orientation
+_FEWEST_ROWS, _MOST_ROWS = 8, 200  # that decide
+_TINY = 1e-4  # misfit that makes no difference, relative to the motion
+_STILL = 0.05  # rotation that makes no difference [rad]
+_EPOCHS = ((1e17, "ns"), (1e14, "us"), (1e11, "ms"))  # times without a unit that are this large
+_GAPS = {"", "nan", "na", "n/a", "null", "none", "<na>"}
 
 
-@dataclass(frozen=True)
-class PartColumns:
-    """Columns of one part."""
-
-    position: tuple[int, ...]  # x, y and z
-    orientation: tuple[int, ...] = ()
-    form: str = ""  # one of ORIENTATIONS, or ""
-
-
-@dataclass(frozen=True)
-class Columns:
-    """Columns of a table by meaning."""
-
-    names: tuple[str, ...]
-    parts: Mapping[str, PartColumns]  # by name of the part, which is "" if columns name no part
-    time: int | None = None
-    part: int | None = None  # of the part's name; None if there are none
-    factors: Mapping[int, float] = field(default_factory=dict)
-    ignored: tuple[str, ...] = ()  # names without meaning
-
-
-def parse_columns(names: Sequence[str], where: str) -> Columns:
-    """Parse column names."""
-    places: dict[tuple[str, str], int] = {}
-    factors: dict[int, float] = {}
-    ignored: list[str] = []
-    for index, name in enumerate(names):
-        part, quantity, factor = _parse_column(name, where)
-        if not quantity:
-            ignored += [name] if name not in ("", SKIP) else []
-            continue
-        if (part, quantity) in places:
-            raise FormatError(f"{where}: there are two columns '{name}'.")
-        places[part, quantity] = index
-        if factor != 1.0:
-            factors[index] = factor
-    time, row_part = places.get(("", TIME)), places.get(("", PART))
-    owners = dict.fromkeys(part for part, quantity in places if quantity not in (TIME, PART))
-    if not owners:
-        raise FormatError(
-            f"{where}: no column is a position; the columns are {_format_list(names)}. {COLUMN_HELP}"
-        )
-    named = next(filter(None, owners), "")
-    if row_part is not None and named:
-        raise FormatError(f"{where}: parts are named in rows and in columns ('{named}'); one or the other.")
-    if "" in owners and named:
-        raise FormatError(f"{where}: some columns belong to a part ('{named}'), others such as 'x' to none.")
-    parts = {part: _parse_part(part, places, where, ignored) for part in owners}
-    return Columns(tuple(names), parts, time, row_part, factors, tuple(ignored))
-
-
-def _parse_column(name: str, where: str) -> tuple[str, str, float]:
-    """Return part, quantity and factor of a column; the quantity is empty if the name has no meaning."""
-    match = _WITH_UNIT.fullmatch(name.strip())
-    assert match is not None  # all parts of the pattern are optional
-    part, quantity = "", match["name"]
-    if of_part := re.fullmatch(r"(.*)[./:]([^./:]*)", match["name"]):
-        part, quantity = of_part[1].strip(), of_part[2].strip()
-    quantity = SYNONYMS.get(quantity.lower(), quantity.lower())
-    if quantity not in QUANTITIES or (part and quantity == PART):
-        return "", "", 1.0
-    if quantity == TIME:
-        part = ""
-    unit = match["unit"]
-    if unit is None:
-        return part, quantity, 1.0
-    units = UNITS.get(quantity, {})
-    if unit not in units:
-        known = f"Known are {', '.join(units)}." if units else "It has none."
-        raise FormatError(f"{where}: the column '{name}' has the unit '{unit}'. {known}")
-    return part, quantity, units[unit]
-
-
-def _parse_part(
-    part: str, places: Mapping[tuple[str, str], int], where: str, ignored: Sequence[str]
-) -> PartColumns:
-    owner = f"{where}: the part '{part}' has" if part else f"{where}: the table has"
-    columns: dict[str, tuple[int, ...]] = {}
-    for form, quantities in {"position": POSITION, **ORIENTATIONS}.items():
-        missing = [quantity for quantity in quantities if (part, quantity) not in places]
-        if not missing:
-            columns[form] = tuple(places[part, quantity] for quantity in quantities)
-        elif len(missing) < len(quantities):
-            hint = f" Not understood: {_format_list(ignored)}." if ignored else ""
-            raise FormatError(f"{owner} no column {', '.join(missing)}.{hint} {COLUMN_HELP}")
-    position = columns.pop("position", None)
-    if position is None:
-        raise FormatError(f"{owner} an orientation, but no position x, y, z.")
-    if len(columns) > 1:
-        raise FormatError(f"{owner} its orientation twice, as {' and '.join(columns)}.")
-    form, orientation = next(iter(columns.items()), ("", ()))
-    return PartColumns(position, orientation, form)
-
-
-def _format_list(names: Sequence[str]) -> str:
-    shown = ", ".join(f"'{name}'" for name in names[:12])
-    return shown if len(names) <= 12 else f"{shown} and {len(names) - 12} more"
-
-
-COMMENT = "#"
-
-
-@dataclass(frozen=True)
-class TextTable:
-    """Text cells of a table file."""
-
-    source: str  # name of the file in messages
-    head: list[str] | None  # column names; None if the file begins with numbers
-    lines: tuple[int, ...]  # line number of each row, counted from 1
-    cells: tuple[list[str], ...]  # texts of each row, equally many in each
-
-
-def read_table(path: Path) -> TextTable:
-    """Read a table with cells separated by commas, semicolons, tabs or spaces.
-
-    Empty lines and lines that begin with ``#`` are skipped. The first other line is the head if one of its
-    cells is not a number. It also determines the separator: a semicolon if it has one, else a comma, else a
-    tab in a head, else spaces.
-    """
-    source, data = str(path), read_file(path)
-    wanted = "poses are read from a table in text"
-    if b"\0" in data:
-        raise FormatError(f"{source}: this is no text, or not in UTF-8; {wanted}.")
-    try:
-        lines = enumerate(data.decode("utf-8-sig").splitlines(), start=1)
-    except UnicodeDecodeError as error:
-        line = data.count(b"\n", 0, error.start) + 1
-        raise FormatError(f"{source}, line {line}: this is no text in UTF-8; {wanted}.") from None
-    texts = {line: text for line, text in lines if text.strip() and not text.lstrip().startswith(COMMENT)}
-    if not texts:
-        raise FormatError(f"{source}: the file is empty; a row for each pose is expected.")
-    (top, first), *_ = texts.items()
-    separator = next((mark for mark in ";,\t" if mark in first), None)
-    if separator == "\t" and all(map(is_number, first.split())):
-        separator = None  # numeric columns, aligned by tabs and spaces
-    cells = {line: _split_cells(text, separator) for line, text in texts.items()}
-    head = None if all(map(is_number, filter(None, cells[top]))) else cells[top]
-    count = len(cells[top])
-    for line, each in cells.items():
-        if len(each) != count:
-            plural = "" if len(each) == 1 else "s"
-            raise FormatError(
-                f"{source}, line {line}: {len(each)} cell{plural}, where line {top} has {count}."
-            )
-    if head is not None:
-        del cells[top]
-    if not cells:
-        raise FormatError(f"{source}: there are names of columns, but no row below them.")
-    return TextTable(source, head, tuple(cells), tuple(cells.values()))
-
-
-def is_number(text: str) -> bool:
-    """Return True if a text is a number, including NaN and infinities."""
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return "_" not in text  # Python also reads digits grouped by underscores
-
-
-def _split_cells(text: str, separator: str | None) -> list[str]:
-    if separator is None:
-        return text.split()
-    return [cell.strip() for cell in next(csv.reader([text], delimiter=separator, skipinitialspace=True))]
-
-
-QUATERNION_TOLERANCE = 0.01
-"""Largest accepted deviation of a quaternion's length from one; two digits suffice."""
-
-
-def read_recording(path: str | os.PathLike[str], columns: str | Sequence[str] | None = None) -> Recording:
+def read_recording(
+    source: str | os.PathLike[str] | Any, columns: str | Sequence[str] | None = None, units: str | None = None
+) -> Recording:
     """Read a table of poses.
-
-    A head names the columns: ``time``, ``part``, ``x``, ``y``, ``z``, and an orientation. The orientation is
-    a quaternion ``qx``, ``qy``, ``qz``, ``qw``, or ``roll``, ``pitch``, ``yaw`` about fixed axes, or a
-    rotation vector ``rx``, ``ry``, ``rz``. Units are [m], [rad] and [s] unless a name says otherwise, as in
-    ``x [mm]``. A row has one part, or all parts with columns such as ``door.x``. Empty cells mark a part that
-    was not observed. Without a head, three columns are positions and seven are positions and quaternions.
 
     Parameters
     ----------
-    path
-        Text file with cells separated by commas, semicolons, tabs or spaces; ``#`` begins a comment.
+    source
+        Path of a text file, a data frame such as that of pandas, a structured array, or an array (N, M).
     columns
-        Column names that replace the head; ``-`` skips a column. A sequence, or one text separated by commas.
+        Names of all columns, separated by commas if in one text; ``-`` for a column to skip. They replace the
+        head of the table.
+    units
+        Units of the columns without one: ``mm``, ``deg``, or ``mm,deg``.
 
     Raises
     ------
     FormatError
-        If the table is malformed or has an invalid number: NaN, a quaternion that is not of unit length, or a
-        time that does not increase. The message names the line.
+        If the table cannot be read, or its meaning is ambiguous. The message names the line or the option.
     """
-    table = read_table(Path(path))
+    table = read_table(Path(source)) if isinstance(source, (str, os.PathLike)) else convert_frame(source)
+    given = {}
+    for unit in filter(None, (units or "").replace(" ", "").split(",")):
+        kind = next((kind for kind in ("length", "angle") if unit in UNITS[kind]), None)
+        if kind is None:
+            raise FormatError(f"'{unit}' is no unit of lengths (m, cm, mm) or angles (rad, deg).")
+        given[kind] = UNITS[kind][unit]
     names = columns.split(",") if isinstance(columns, str) else columns
-    by_meaning = _choose_columns(table, None if names is None else [name.strip() for name in names])
-    tracks = {
-        part or name: _build_track(table, by_meaning, where, rows)
-        for part, where in by_meaning.parts.items()
-        for name, rows in _rows_by_part(table, by_meaning, where).items()
+    return _Reader(table, None if names is None else [name.strip() for name in names], given).read()
+
+
+Reading = Callable[[Array], Array]
+READINGS: Mapping[str, Mapping[str, Reading]] = MappingProxyType(
+    {
+        "quaternion": {"": quaternion},
+        UNORDERED: {"qx,qy,qz,qw": quaternion, "qw,qx,qy,qz": lambda q: quaternion(np.roll(q, -1, axis=-1))},
+        "matrix": {"": lambda numbers: quaternion(to_quaternion(numbers.reshape(-1, 3, 3)))},
+        "rpy": {"rad": rpy, "deg": lambda angles: rpy(np.radians(angles))},
+        "rotation vector": {"rad": exp_so3, "deg": lambda vectors: exp_so3(np.radians(vectors))},
     }
-    tracks = {name: track for name, track in tracks.items() if len(track)}
-    if not tracks:
-        raise FormatError(f"{table.source}: nothing was observed in any row.")
-    return Recording(table.source, tracks, by_meaning.ignored)
+)
+"""Rotations of the numbers of each representation; of several readings the first is that of exact names."""
 
 
-def _choose_columns(table: TextTable, names: Sequence[str] | None) -> Columns:
-    count = len(table.cells[0])
-    if names is not None:
-        if len(names) != count:
+class _Reader:
+    """Reader of one table, and its assumptions."""
+
+    def __init__(self, table: Table, names: list[str] | None, units: dict[str, float]) -> None:
+        self.table, self.units, self.assumed = table, units, [*table.assumed]
+        self.columns = self._parse_names(names)
+
+    def read(self) -> Recording:
+        """Return the tracks of all parts."""
+        source, lines = self.table.source, self.table.lines
+        found = {
+            part or name: (where, rows)
+            for part, where in self.columns.parts.items()
+            for name, rows in self._rows_by_part(where).items()
+            if len(rows)
+        }
+        if not found:
+            raise FormatError(f"{source}: nothing was observed in any row.")
+        poses = {name: self._parse_numbers(where.position, rows) for name, (where, rows) in found.items()}
+        scale = self._length_unit([*poses.values()])
+        poses = {name: scale * positions for name, positions in poses.items()}
+        for form in {where.form: None for where, _ in found.values() if where.form}:
+            numbers = {}
+            for name, (where, rows) in found.items():
+                if where.form == form:
+                    numbers[name] = self._parse_numbers(where.orientation, rows)
+                    self._check_rotations(numbers[name], rows)
+            read = READINGS[form][self._choose_reading(form, numbers, poses)]
+            poses |= {name: transform(read(some), poses[name]) for name, some in numbers.items()}
+        tracks = {
+            name: RecordedTrack(poses[name], rows, lines[rows], self._parse_times(rows), self._frame(rows))
+            for name, (_, rows) in found.items()
+        }
+        return Recording(source, tracks, self.columns.ignored, tuple(dict.fromkeys(self.assumed)))
+
+    def _parse_names(self, names: list[str] | None) -> Columns:
+        table, count = self.table, self.table.cells.shape[1]
+        if names is not None:
+            if len(names) != count:
+                raise FormatError(
+                    f"{table.source} has {count} columns, and there are {len(names)} names: "
+                    f"{','.join(names)}. A column that is not wanted is called '-'."
+                )
+            return parse_columns(names, "The names of the columns")
+        if table.head is not None:
+            # Some programs number the rows in a column of this name, others name the part in it.
+            numbered = {k for k, name in enumerate(table.head) if name.lower() == "frame"}
+            numbered = {k for k in numbered if all(map(is_number, table.cells[:, k]))}
+            head = ["-" if k in numbered else name for k, name in enumerate(table.head)]
+            return parse_columns(head, f"{table.source}, line 1" if table.lines[0] == 2 else table.source)
+        kinds = "".join("n" if _is_gap(cell) or is_number(cell) else "t" for cell in table.cells[0])
+        if kinds not in UNNAMED_COLUMNS:
             raise FormatError(
-                f"{table.source} has {count} columns, and there are {len(names)} names: {','.join(names)}. A "
-                "column that is not wanted is called '-'."
+                f"{table.source}: {count} columns without names. 3 are taken for positions, 7 for poses, 8 "
+                f"for times and poses, 12 or 16 for matrices; others need names. {COLUMN_HELP}"
             )
-        return parse_columns(names, "The names of the columns")
-    if table.head is not None:
-        return parse_columns(table.head, f"{table.source}, line 1" if table.lines[0] == 2 else table.source)
-    if count not in UNNAMED_COLUMNS:
-        raise FormatError(
-            f"{table.source}: {count} columns without names. 3 are taken for {UNNAMED_COLUMNS[3]} and 7 for "
-            f"{UNNAMED_COLUMNS[7]}; otherwise name them (--columns). {COLUMN_HELP}"
-        )
-    return parse_columns(UNNAMED_COLUMNS[count].split(","), table.source)
+        found = UNNAMED_COLUMNS[kinds]
+        if count > 3 and "q1" not in found:
+            self.assumed.append(f"columns {found}")
+        return parse_columns(found.split(","), table.source)
 
+    def _rows_by_part(self, where: PartColumns) -> dict[str, Indices]:
+        observed: dict[str, list[int]] = {}
+        columns, needed, gaps = self.columns, (*where.position, *where.orientation), 0
+        for row, cells in enumerate(self.table.cells):
+            name = "" if columns.part is None else cells[columns.part]
+            if columns.part is not None and not name:
+                raise FormatError(f"{self._at(row)}: the name of the part is missing.")
+            rows, lacking = observed.setdefault(name, []), [k for k in needed if _is_gap(cells[k])]
+            if not lacking:
+                rows.append(row)
+            elif len(lacking) < len(needed):
+                rule = "all cells of a part that was not observed are empty or NaN"
+                raise FormatError(f"{self._at(row)}: {columns.names[lacking[0]]} is missing; {rule}.")
+            gaps += any(cells[k] for k in lacking)
+        if gaps:
+            self.assumed.append(f"{gaps} rows of NaN are gaps")
+        return {name: np.array(rows, dtype=np.intp) for name, rows in observed.items()}
 
-def _rows_by_part(table: TextTable, columns: Columns, where: PartColumns) -> dict[str, Indices]:
-    observed: dict[str, list[int]] = {}
-    needed = (*where.position, *where.orientation)
-    for row, cells in enumerate(table.cells):
-        name, place = "" if columns.part is None else cells[columns.part], f"line {table.lines[row]}"
-        if columns.part is not None and not name:
-            raise FormatError(f"{table.source}, {place}: the name of the part is missing.")
-        rows, lacking = observed.setdefault(name, []), [columns.names[k] for k in needed if not cells[k]]
-        if not lacking:
-            rows.append(row)
-        elif len(lacking) < len(needed):
-            rule = "all cells of a part that was not observed are empty"
-            raise FormatError(f"{table.source}, {place}: {lacking[0]} is missing; {rule}.")
-    return {name: np.array(rows, dtype=np.intp) for name, rows in observed.items()}
+    def _at(self, row: int) -> str:
+        return f"{self.table.source}, line {self.table.lines[row]}"
 
+    def _parse_numbers(self, places: Sequence[int], rows: Indices) -> Array:
+        texts = self.table.cells[rows][:, places]
+        good = np.array([[is_number(text) and abs(float(text)) <= LARGEST for text in row] for row in texts])
+        if not good.all():
+            row, k = np.argwhere(~good)[0]
+            hint = " A decimal point is expected." if "," in texts[row, k] else ""
+            raise FormatError(
+                f"{self._at(rows[row])}: {self.columns.names[places[k]]} is '{texts[row, k][:40]}', which is "
+                f"no finite number.{hint}"
+            )
+        return np.asarray(texts.astype(np.float64) * [self.columns.factors.get(k, 1.0) for k in places])
 
-def _build_track(table: TextTable, columns: Columns, where: PartColumns, rows: Indices) -> RecordedTrack:
-    lines = np.array(table.lines, dtype=np.intp)[rows]
-    poses = _parse_numbers(table, columns, where.position, rows)
-    if where.form:
-        poses = transform(_rotations(table, columns, where, rows), poses)
-    times = None
-    if columns.time is not None:
-        times = _parse_numbers(table, columns, (columns.time,), rows)[:, 0]
-        _check_order(table, times, lines)
-    return RecordedTrack(poses, rows, lines, times)
+    def _length_unit(self, positions: list[Array]) -> float:
+        """Return the unit of lengths [m] beyond those of the head."""
+        is_metric = self.columns.is_metric
+        if "length" in self.units:
+            lengths = {k for part in self.columns.parts.values() for k in part.position}
+            return 1.0 if lengths & {*self.columns.factors} else self.units["length"]
+        ends = [np.quantile(part, _INLYING, axis=0) for part in positions]
+        wide, far = max(np.ptp(end, axis=0).max() for end in ends), max(np.abs(end).max() for end in ends)
+        is_possible = wide <= ROOM and far <= FARTHEST
+        if is_possible and (is_metric or wide <= _DOUBTFUL):
+            return 1.0
+        if is_possible or is_metric or max(wide, far) > 1000.0 * ROOM:
+            what = "are these metres or millimetres?" if is_possible else "no room holds this, if in metres."
+            raise FormatError(
+                f"{self.table.source}: positions range over {wide:.3g} and reach {far:.3g}; {what} Say "
+                "--units m or --units mm."
+            )
+        self.assumed.append("lengths in mm")
+        return 0.001
 
-
-def _parse_numbers(table: TextTable, columns: Columns, places: Sequence[int], rows: Indices) -> Array:
-    texts = [[table.cells[row][k] for k in places] for row in rows]
-    good = np.array([[is_number(text) for text in row] for row in texts], dtype=bool)
-    if good.all():
-        numbers = np.array(texts, dtype=np.float64).reshape(len(rows), len(places))
-        good = np.abs(numbers) <= LARGEST  # NaN is not
-    if not good.all():
-        row, k = np.argwhere(~good)[0]
-        text, name = texts[row][k], columns.names[places[k]]
-        hint = " A decimal point is expected." if "," in text else ""
-        hint = " All cells of a part that was not observed are empty." if text.lower() == "nan" else hint
-        raise FormatError(
-            f"{table.source}, line {table.lines[rows[row]]}: {name} is '{text[:40]}', which is no finite "
-            f"number.{hint}"
-        )
-    return np.asarray(numbers * np.array([columns.factors.get(k, 1.0) for k in places]))
-
-
-def _rotations(table: TextTable, columns: Columns, where: PartColumns, rows: Indices) -> Array:
-    numbers = _parse_numbers(table, columns, where.orientation, rows)
-    if where.form == "quaternion":
+    def _check_rotations(self, numbers: Array, rows: Indices) -> None:
+        """Raise an error if quaternions are not of unit length, or matrices are no rotations."""
         lengths = np.linalg.norm(numbers, axis=1)
         off = np.abs(lengths - 1.0)
-        if off.size and off.max() > QUATERNION_TOLERANCE:
-            worst = int(np.argmax(off > QUATERNION_TOLERANCE))
+        if numbers.shape[1] == 9:
+            off = np.abs(READINGS["matrix"][""](numbers).reshape(-1, 9) - numbers).max(axis=1)
+        wrong = np.flatnonzero(off > _ROTATION_TOLERANCE).tolist() if numbers.shape[1] > 3 else []
+        if wrong:
+            k = wrong[0]
+            what = f"the quaternion has the length {lengths[k]:.4g}"
+            what = "the matrix is no rotation" if numbers.shape[1] == 9 else what
             raise FormatError(
-                f"{table.source}, line {table.lines[rows[worst]]}: the quaternion has the length "
-                f"{lengths[worst]:.4g}, which is off by {off[worst]:.2g}; "
-                f"{int((off > QUATERNION_TOLERANCE).sum())} of {len(off)} are not of unit length."
+                f"{self._at(rows[k])}: {what}, which is off by {off[k]:.2g}; {len(wrong)} of {len(off)} are. "
+                "If the columns mean something else, name them: --columns."
             )
-        return quaternion(numbers)
-    return rpy(numbers) if where.form == "rpy" else exp_so3(numbers)
+
+    def _choose_reading(self, form: str, numbers: dict[str, Array], positions: dict[str, Array]) -> str:
+        """Return the order of the quaternions or the unit of the angles."""
+        first, *others = READINGS[form]
+        wheres = [where for where in self.columns.parts.values() if where.form == form]
+        if not others or any(k in self.columns.factors for where in wheres for k in where.orientation):
+            return first
+        if form != UNORDERED and "angle" in self.units:
+            return "rad" if self.units["angle"] == 1.0 else "deg"
+        rotations = {
+            name: {r: read(some) for r, read in READINGS[form].items()} for name, some in numbers.items()
+        }
+        decided = next(filter(None, (_decide(positions[name], each) for name, each in rotations.items())), "")
+        if form != UNORDERED:
+            largest = max(float(np.abs(some).max()) for some in numbers.values())
+            reading = decided or ("deg" if largest > 2.0 * math.pi else "rad")
+            self.assumed.append(f"angles in {reading}")
+            return reading
+        options = {r: ",".join(self.columns.names).replace("q1,q2,q3,q4", r) for r in READINGS[form]}
+        turns = [rotation_angle(each[first][0].T @ each[first]).max() for each in rotations.values()]
+        if not decided and max(turns) > _STILL:
+            raise FormatError(
+                f"{self.table.source}: is the order of the quaternion x, y, z, w, or w, x, y, z? The motion "
+                f"does not show it. Say --columns {' or --columns '.join(options.values())}."
+            )
+        self.assumed.append(f"columns {options[decided or first]}")
+        return decided or first
+
+    def _parse_times(self, rows: Indices) -> Array | None:
+        if not self.columns.times:
+            return None
+        cells, lines = self.table.cells, self.table.lines[rows]
+        # A stamp that nobody filled in stands still.
+        moving = (places for places in self.columns.times if (cells[:, places] != cells[0, places]).any())
+        places = next(moving, self.columns.times[0])
+        try:
+            dates = [] if is_number(cells[rows[0], places[0]]) else cells[rows, places[0]].tolist()
+            dates = [datetime.fromisoformat(text) for text in dates]
+        except ValueError:
+            dates = []
+        times = np.array([date.replace(tzinfo=date.tzinfo or UTC).timestamp() for date in dates])
+        times = times if dates else self._parse_numbers(places, rows).sum(axis=1)
+        unit = next((unit for least, unit in _EPOCHS if abs(times[0]) > least), None)
+        if unit and places[0] not in self.columns.factors:
+            times *= UNITS["time"][unit]
+            self.assumed.append(f"times in {unit}")
+        for k in np.flatnonzero(np.diff(times) <= 0.0).tolist():
+            how = "the same time as" if times[k + 1] == times[k] else "earlier than"
+            raise FormatError(
+                f"{self._at(rows[k + 1])}: {times[k + 1]:.10g} s is {how} line {lines[k]} of the same part "
+                f"({times[k]:.10g} s). Rows are expected in the order of their times."
+            )
+        return times
+
+    def _frame(self, rows: Indices) -> str:
+        """Return the frame that the poses are in; an empty text if it is not known."""
+        if self.columns.frame is None:
+            return ""
+        frames = self.table.cells[rows, self.columns.frame]
+        if others := np.flatnonzero(frames != frames[0]).tolist():
+            raise FormatError(
+                f"{self._at(rows[others[0]])}: poses of one part are in the frames '{frames[0]}' and "
+                f"'{frames[others[0]]}'. One frame for all of them is expected."
+            )
+        return str(frames[0])
 
 
-def _check_order(table: TextTable, times: Array, lines: Indices) -> None:
-    for k in np.flatnonzero(np.diff(times) <= 0.0).tolist():
-        how = "the same time as" if times[k + 1] == times[k] else "earlier than"
-        raise FormatError(
-            f"{table.source}, line {lines[k + 1]}: {times[k + 1]:.10g} s is {how} line {lines[k]} of the "
-            f"same part ({times[k]:.10g} s). Rows are expected in the order of their times."
-        )
+def _is_gap(text: str) -> bool:
+    return text.lower() in _GAPS
+
+
+def _decide(positions: Array, readings: Mapping[str, Array]) -> str:
+    """Return the reading in which the part turns about a point at rest; an empty text if none does clearly.
+
+    A hinge or a ball has p = c + R a, with a constant point c and a constant lever a.
+    """
+    some = spaced_indices(len(positions), _MOST_ROWS)
+    if len(some) < _FEWEST_ROWS:
+        return ""
+    p = positions[some] - positions.mean(axis=0)
+    misfits = {}
+    for reading, rotations in readings.items():
+        design = np.concatenate([np.broadcast_to(np.eye(3), (len(some), 3, 3)), rotations[some]], axis=2)
+        solution = np.linalg.lstsq(design.reshape(-1, 6), p.reshape(-1), rcond=None)[0]
+        misfits[reading] = float(np.linalg.norm(design @ solution - p)) + _TINY * float(np.linalg.norm(p))
+    best, other = sorted(misfits, key=misfits.__getitem__)
+    return best if misfits[other] > _DECISIVE * misfits[best] else ""

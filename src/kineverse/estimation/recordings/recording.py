@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
@@ -29,12 +30,15 @@ class RecordedTrack:
         Lines of the file, (N,).
     times
         (N,) [s]; None if the table has no times.
+    frame
+        Name of the frame that the poses are in; empty if it is not known.
     """
 
     poses: Array
     rows: Indices
     lines: Indices
     times: Array | None = None
+    frame: str = ""
 
     @property
     def has_orientation(self) -> bool:
@@ -135,11 +139,14 @@ class Recording:
         Tracks by name of the part; a table without names has one, called "".
     ignored
         Columns without meaning.
+    assumptions
+        Meanings that the table leaves open, such as "angles in deg".
     """
 
     source: str
     tracks: Mapping[str, RecordedTrack]
     ignored: tuple[str, ...] = ()
+    assumptions: tuple[str, ...] = ()
 
     def pair(self, parent: str = WORLD, child: str | None = None) -> RecordedPair:
         """Synchronise the poses of two parts.
@@ -183,6 +190,9 @@ class Recording:
     def _track(self, name: str) -> RecordedTrack:
         if list(self.tracks) == [""] and name != WORLD:
             return self.tracks[""]
+        ends = [known for known in self.tracks if re.split("[./:]", known)[-1] == name]
+        if name not in self.tracks and len(ends) == 1:
+            return self.tracks[ends[0]]
         if name not in self.tracks:
             hint = suggest(name, self.tracks, "part")
             raise UnknownNameError(f"{self.source} has no part '{name}'. {hint}")
@@ -193,6 +203,11 @@ class Recording:
             raise FormatError(
                 f"{self.source}: only positions of the parent '{parent}' were observed. A motion in its "
                 "frame takes its orientation."
+            )
+        if a.frame != b.frame:
+            raise FormatError(
+                f"{self.source}: '{parent}' was observed in the frame '{a.frame}', and '{child}' in "
+                f"'{b.frame}'. One frame for both is expected."
             )
         # Pair by time, else by row. In a table with one part per row, rows pair nothing.
         is_timed = a.times is not None and b.times is not None

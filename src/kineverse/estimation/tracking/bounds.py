@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from kineverse.compilation import compile
+from kineverse.estimation.linear_algebra import inverse_spd
 from kineverse.expressions.expression import array, as_expression
 from kineverse.lie import Array
 from kineverse.model.constraint import Constraint
@@ -199,16 +200,15 @@ class SpeedLocks:
 _LEAST = 1e-12
 
 
-def solve_bounded_qp(
-    inverse: Array, gradient: Array, rows: Array, lower: Array, upper: Array
-) -> Array | None:
-    """Minimise ½xᵀAx + gᵀx subject to lower <= rows x <= upper, given A⁻¹; return None if infeasible.
+def solve_bounded_qp(matrix: Array, vector: Array, rows: Array, lower: Array, upper: Array) -> Array | None:
+    """Minimise ½xᵀAx - vᵀx subject to lower <= rows x <= upper; return None if infeasible.
 
     The dual method starts at the unconstrained minimum and adds violated bounds one by one, so most calls end
     at once (Goldfarb and Idnani, A numerically stable dual method for solving strictly convex quadratic
     programs, 1983).
     """
-    x = -inverse @ gradient
+    inverse = inverse_spd(matrix)
+    x = inverse @ vector
     normals = np.concatenate([rows, -rows])
     bounds = np.concatenate([lower, -upper])
     scale = _LEAST * (1.0 + np.where(np.isfinite(bounds), np.abs(bounds), 0.0))

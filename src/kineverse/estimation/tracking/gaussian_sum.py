@@ -3,27 +3,26 @@
 Each group has its own components. They are kept until the evidence of one exceeds that of the others by far
 (Alspach and Sorenson, Nonlinear Bayesian estimation using Gaussian sum approximations, 1972).
 
-Mirror images predict the same measurements from different states and stay apart. Points along an unobservable
-ridge also predict the same; the ridge covariance covers them, so they are merged.
+Mirror images predict the same measurements from different states and stay apart.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
-from kineverse.estimation.linear_algebra import inverse_spd
 from kineverse.lie import Array
-from kineverse.symbols import Symbol
 
-from .covariance import RidgeCovariance
 from .information_state import InformationState
-from .observability import Components
-from .state_space import CoordinateGroup, Layout
+from .state_space import Layout
+
+if TYPE_CHECKING:
+    from .gaussian_sum_filter import UpdateStep
 
 MOST_COMPONENTS = 8  # largest number of components of a group
 
@@ -36,12 +35,10 @@ class Candidate:
     """Candidate component for some groups."""
 
     belief: InformationState  # belief after the update
-    predicted: Array  # predicted measurements there
-    weights: Array | None  # inlier weight of each observation; None if all are 1
+    weights: Array  # inlier weight of each observation
     nis: Array  # normalised innovation squared of each group
     dof: Array  # its degrees of freedom
     groups: Sequence[int]  # numbers of the groups
-    covariances: dict[int, Array] = field(default_factory=dict)
 
 
 class GaussianSum:
@@ -77,14 +74,12 @@ class GaussianSum:
         return float(sum(np.logaddexp.reduce(self.evidence(number)) for number in range(count)))
 
     def select(
-        self,
-        candidates: Sequence[Candidate],
-        should_merge: Callable[[CoordinateGroup, Candidate, Candidate], bool],
+        self, candidates: Sequence[Candidate], step: UpdateStep, inputs: Array
     ) -> tuple[GaussianSum, list[Candidate | None]]:
         """Prune and merge candidates to new components; also return the best candidate of each group."""
         kept: list[list[InformationState]] = []
         best: list[Candidate | None] = []
-        for number, group in enumerate(self._layout.groups):
+        for number in range(len(self._layout.groups)):
             ranked = [c for c in candidates if number in c.groups]
             ranked.sort(key=lambda c: -float(c.belief.evidence[number]))
             chosen: list[Candidate] = []
@@ -92,7 +87,7 @@ class GaussianSum:
                 deficit = ranked[0].belief.evidence[number] - one.belief.evidence[number]
                 if deficit > PRUNING_LOG_RATIO or len(chosen) == MOST_COMPONENTS:
                     break
-                if not any(should_merge(group, one, other) for other in chosen):
+                if not any(_are_one(one.belief, other.belief, number, step, inputs) for other in chosen):
                     chosen.append(one)
             kept.append([c.belief for c in chosen] or self.components(number))
             best.append(chosen[0] if chosen else None)
@@ -137,44 +132,26 @@ class GaussianSum:
 # Candidates merge if their predictions differ by fewer deviations of the noise, and each coordinate of the
 # state by fewer of its own.
 _SAME_PREDICTION, _NEAR = 0.3, 3.0
+_EQUAL = 1e-3  # states that differ by fewer deviations predict the same
 
 
-class MergeCriterion:
-    """Criterion for two candidates that are one component."""
-
-    def __init__(self, components: Components, ridge_covariance: RidgeCovariance) -> None:
-        self._layout, self._residuals, self._process_model, self._reader, *_ = components
-        self._ridge_covariance = ridge_covariance
-
-    def should_merge(
-        self,
-        inputs: Array,
-        periods: Mapping[Symbol, float],
-        group: CoordinateGroup,
-        one: Candidate,
-        other: Candidate,
-    ) -> bool:
-        """Return True if two candidates predict the same measurements of a group from nearby states."""
-        empty = self._reader.empty()
-        predicted = empty._replace(values=self._reader.as_values(other.predicted), mask=~empty.mask)
-        errors = self._residuals.errors(one.predicted, predicted, group.observation_indices)
-        if any(float(e @ e) >= _SAME_PREDICTION**2 for e, _ in errors.values()):
-            return False
-        number, here = self._layout.groups.index(group), other.belief.x[group.x]
-        change = one.belief.x[group.x] - here
-        for k, x in enumerate(group.coordinates):
-            if x in periods:
-                change[k] = math.remainder(change[k], periods[x])
-        # Between both states, to first order.
-        step = np.linalg.pinv(self._process_model.basis(number, here, inputs)) @ change
-        bound = _NEAR**2 * len(step)
-        if float(step @ other.belief.information[group.block] @ step) < bound:
-            return True
-        record, known = one.belief.records[number], other.belief.records[number]
-        if record is None or known is None:
-            return False
-        if min(record.count, known.count) > 1 and record.branch is not known.branch:
-            return False  # separate components of earlier updates
-        if number not in other.covariances:
-            other.covariances[number] = self._ridge_covariance.compute(number, other.belief)
-        return float(step @ inverse_spd(other.covariances[number]) @ step) < bound
+def _are_one(
+    one: InformationState, other: InformationState, number: int, step: UpdateStep, inputs: Array
+) -> bool:
+    """Return True if two beliefs predict the same measurements of a group from nearby states."""
+    group, here = step.layout.groups[number], other.x[step.layout.groups[number].x]
+    change = one.x[group.x] - here
+    for k, x in enumerate(group.coordinates):
+        if x in step.periods:
+            change[k] = math.remainder(change[k], step.periods[x])
+    # Between both states, to first order.
+    between = (
+        np.linalg.pinv(step.process_model.basis(number, here, inputs)) @ change if group.by_speeds else change
+    )
+    squared = float(between @ other.information[group.block] @ between)
+    if squared < _EQUAL**2 or squared >= _NEAR**2 * len(between):
+        return squared < _EQUAL**2
+    here, there = (step.residuals.evaluate(belief.x, inputs) for belief in (other, one))
+    reading = step.reader.as_reading(here, group.observation_indices)
+    errors = step.residuals.errors(there, reading, group.observation_indices)
+    return all(float(e @ e) < _SAME_PREDICTION**2 for e, _ in errors.values())

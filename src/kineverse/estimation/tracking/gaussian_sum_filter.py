@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 import numpy.typing as npt
@@ -16,18 +16,17 @@ from kineverse.lie import Array
 from kineverse.symbols import Symbol
 
 from .bounds import StateBounds
-from .covariance import CovarianceInflation, RidgeCovariance
-from .gaussian_sum import Candidate, GaussianSum, MergeCriterion
+from .gaussian_sum import Candidate, GaussianSum
 from .information_state import InformationState
-from .map_update import MapResult, MapSolver
-from .native import NativeInlierSolver, NativeMapSolver, native_library
+from .map_update import Loss, MapResult, MapSolver
+from .native import NativeMapSolver, native_library
 from .observability import (
-    Components,
+    RidgeCovariance,
     StaticBatch,
-    StationaryPoints,
     UnobservableDirections,
     find_unexplained,
-    move_origin,
+    restart_states,
+    turned_states,
 )
 from .process_model import ProcessModel, Speeds
 from .residuals import MeasurementReader, Measurements, Residuals
@@ -47,6 +46,8 @@ class StepResult:
 
 
 _OUTSIDE = 1e-9
+# With these odds a measurement is certainly an inlier, and a group has no other explanation.
+_LOG_CERTAIN = math.log(1000.0)
 _SETTLED = 1e-5  # a belief closer to its mean, in deviations, is about its mean, as after an update
 
 
@@ -55,27 +56,19 @@ class UpdateStep:
 
     def __init__(self, layout: Layout, limits: StateBounds, outliers: Outliers | None) -> None:
         self.layout, self.limits, self.outliers = layout, limits, outliers
+        self._group_of, self._all_groups = np.array(layout.group_of), list(range(len(layout.groups)))
         self.function = layout.compile_function()
         self.process_model = ProcessModel(layout)
         self.velocity: SpeedProcess | None = None
         self.residuals = Residuals(layout, self.function)
         self.reader = MeasurementReader(layout)
-        self.solver = MapSolver(layout, self.residuals, self.process_model, limits)
+        self.solver = MapSolver(layout, self.residuals, self.process_model, limits, outliers)
+        suits = NativeMapSolver.suits(layout)
+        self.native = NativeMapSolver(self.solver, self.function) if suits else None
         self.unobservable = UnobservableDirections(layout)
-        shared = layout, self.residuals, self.process_model, self.reader
-        components = Components(*shared, self.solver.group_bounds, self.unobservable)
-        self.static_batch = StaticBatch(components, self.solver, self._map_update)
-        self.ridge_covariance, self.inflation = RidgeCovariance(components), CovarianceInflation(components)
-        self.merge_criterion = MergeCriterion(components, self.ridge_covariance)
-        self.stationary_points = StationaryPoints(components)
-        self.native = (
-            NativeMapSolver(layout, limits, self.function, self.process_model)
-            if NativeMapSolver.suits(layout)
-            else None
-        )
-        self.inlier_solver = (
-            NativeInlierSolver(layout, self.native, outliers) if self.native and outliers else None
-        )
+        self.static_batch, self.ridge_covariance = StaticBatch(self), RidgeCovariance(self)
+        # The cost of such a group is convex: a restart ends where the update did.
+        self._is_affine = [layout.is_affine(number) for number in self._all_groups]
         self.periods: Mapping[Symbol, float] = {}
         self.counted: frozenset[Symbol] = frozenset()
         if self.native:
@@ -83,7 +76,7 @@ class UpdateStep:
 
     @property
     def is_native(self) -> bool:
-        """True if unambiguous updates run in compiled C."""
+        """True if updates run in compiled C."""
         return self.native is not None and self.native.is_ready
 
     @property
@@ -99,87 +92,94 @@ class UpdateStep:
 
     def _update(self, mixture: GaussianSum, reading: Measurements, inputs: Array) -> StepResult:
         mixture = self._forget_other_inputs(mixture, inputs)
-        if len(mixture.beliefs) > 1 or self.outliers is not None:
-            return self._update_mixture(mixture, reading, inputs)
-        before = mixture.best
-        result = self._map_update(before, reading, inputs)
-        self.static_batch.relinearise(before, result, reading, inputs)
-        _require_finite(result.belief.numbers)
-        after = GaussianSum(self.layout, [result.belief], mixture.alive)
-        unexplained = self.stationary_points.unexplained(before, result)
-        candidates = self._restart(before, result, reading, inputs, unexplained) if unexplained else []
-        if self.counted and (turned := find_unexplained(result)):
-            candidates += self._try_other_turns(before, result, reading, inputs, turned)
-            unexplained = sorted({*unexplained, *turned})
-        if not candidates:
-            return StepResult(after, result.nis, result.dof, (), result.rounds)
-        first = self._candidate(result, unexplained, inputs)
-        should_merge = partial(self.merge_criterion.should_merge, inputs, self.periods)
-        after, best = after.select([first, *candidates], should_merge)
-        for number, candidate in enumerate(best):
-            if candidate:
-                result.nis[number] = candidate.nis[number]
-        return StepResult(after, result.nis, result.dof, (), result.rounds)
-
-    def _map_update(
-        self, belief: InformationState, reading: Measurements, inputs: Array, groups: list[int] | None = None
-    ) -> MapResult:
-        if self.native is not None and self.native.is_ready:
-            if (result := self.native.update(belief, reading, inputs)) is not None:
-                return result
-        groups = self._measured_groups(reading) if groups is None else groups
-        return self.solver.update(belief, reading, inputs, groups)
-
-    def _restart(
-        self,
-        old: InformationState,
-        result: MapResult,
-        reading: Measurements,
-        inputs: Array,
-        groups: list[int],
-    ) -> list[Candidate]:
-        starts = self.stationary_points.restart_states(old, result.belief, groups, inputs)
-        return [one for start in starts for one in self._restart_from(start, reading, inputs, groups)]
-
-    def _try_other_turns(
-        self,
-        old: InformationState,
-        result: MapResult,
-        reading: Measurements,
-        inputs: Array,
-        groups: list[int],
-    ) -> list[Candidate]:
-        """Return candidates on other turns of counted coordinates, such as a pinion on its rack."""
-        candidates: list[Candidate] = []
-        for x in self.counted:
-            i = self.layout.tangent_space.coordinates.index(x)
-            number = next(n for n, group in enumerate(self.layout.groups) if i in group.x)
-            group = self.layout.groups[number]
-            if number not in groups or group.by_speeds:
+        measured = self._measured_groups(reading)
+        candidates, rounds = self._solve_unambiguous(mixture, reading, inputs, measured)
+        settled = candidates[0].groups if candidates else ()
+        if len(mixture.beliefs) == 1 and len(settled) == len(measured) and candidates:
+            one, alive = candidates[0], mixture.alive
+            return StepResult(GaussianSum(self.layout, [one.belief], alive), one.nis, one.dof, (), rounds)
+        remaining = [number for number in measured if number not in settled]
+        for component, belief in enumerate(mixture.beliefs):
+            groups = mixture.groups(component, remaining)
+            if not groups:
                 continue
-            place, off = result.belief.x.copy(), []
-            for turn in (0.0, math.tau):
-                place[i] = result.belief.x[i] + turn
-                out = self.residuals.evaluate(place, inputs)
-                errors = self.residuals.errors(out, reading, group.observation_indices)
-                off.append(np.concatenate([error for error, _ in errors.values()]))
-            change = off[1] - off[0]
-            turns = round(-float(off[0] @ change) / max(float(change @ change), np.finfo(float).tiny))
-            if turns:
-                place[i] = result.belief.x[i] + turns * math.tau
-                start = old.copy()
-                there = place[group.x]
-                move_origin(start, number, group, there, there - old.x[group.x], None)
-                candidates += self._restart_from(start, reading, inputs, [number])
-        return candidates
+            try:
+                new, count = self._explain(belief, reading, inputs, groups, component == 0)
+            except KineverseError:
+                # The best component must succeed; others that fail are dropped.
+                if component == 0:
+                    raise
+                continue
+            candidates += new
+            rounds = max(rounds, count)
+        after, best = mixture.select(candidates, self, inputs)
+        nis = np.array([c.nis[n] if c else 0.0 for n, c in enumerate(best)])
+        dof = np.array([c.dof[n] if c else 0.0 for n, c in enumerate(best)])
+        of_group = [(i, best[n]) for i, n in enumerate(self.layout.group_of) if reading.mask[i]]
+        rejected = [i for i, candidate in of_group if candidate is not None and candidate.weights[i] < 0.5]
+        return StepResult(after, nis, dof, tuple(rejected), rounds)
+
+    def solve(
+        self,
+        belief: InformationState,
+        reading: Measurements,
+        inputs: Array,
+        groups: list[int],
+        loss: Loss = "gaussian",
+    ) -> MapResult:
+        """Update some groups of one component."""
+        if self.native is not None and self.native.is_ready:
+            if (result := self.native.update(belief, reading, inputs, groups, loss)) is not None:
+                return result
+        return self.solver.update(belief, reading, inputs, groups, loss)
+
+    def _solve_unambiguous(
+        self, mixture: GaussianSum, reading: Measurements, inputs: Array, groups: list[int]
+    ) -> tuple[list[Candidate], int]:
+        """Return the candidate of all groups for which there is only one, and the number of evaluations."""
+        belief, single = mixture.best, groups
+        if len(mixture.beliefs) > 1:
+            count = mixture.alive.sum(axis=0)
+            single = [number for number in groups if count[number] == 1]
+        try:
+            result = self.solve(belief, reading, inputs, single)
+        except KineverseError:
+            if self.outliers is None:
+                raise
+            return [], 0  # a gross error is too far away for least squares
+        if self.outliers is None:
+            unexplained = find_unexplained(result)
+            if unexplained and not self.counted:
+                unexplained = self._find_unobserved(belief, result)
+            settled = [n for n in single if n not in unexplained] if unexplained else single
+        else:
+            are_certain = self._are_inliers(belief, result, reading, self.outliers)
+            settled = [number for number in single if are_certain[number]]
+        return [self._relinearised(belief, result, reading, inputs, settled)], result.rounds
+
+    def _are_inliers(
+        self, before: InformationState, result: MapResult, reading: Measurements, outliers: Outliers
+    ) -> npt.NDArray[np.bool_]:
+        """Return True for each group whose measurements are certain inliers, and add this to its evidence."""
+        log_inlier, log_outlier = math.log(1 - outliers.fraction), self.solver.outlier_densities(reading)
+        is_doubtful = log_inlier - result.squares / 2 - log_outlier < _LOG_CERTAIN
+        as_inliers, as_outliers, doubts = (
+            np.bincount(self._group_of, np.where(reading.mask, each, 0.0), len(self.layout.groups))
+            for each in (log_inlier, log_outlier - reading.log_scale, is_doubtful)
+        )
+        result.belief.evidence += as_inliers
+        gained = result.belief.evidence - before.evidence
+        return np.asarray((gained - as_outliers > _LOG_CERTAIN) & (doubts == 0))
 
     def _restart_from(
         self, start: InformationState, reading: Measurements, inputs: Array, groups: list[int]
     ) -> list[Candidate]:
         try:
-            if self.outliers is not None:
-                start = self.solver.find_robust_start(start, reading, inputs, groups)
-            result = self.solver.update(start, reading, inputs, groups, self.outliers or "gaussian")
+            if self.outliers is None:
+                result = self.solve(start, reading, inputs, groups)
+            else:
+                robust = self.solve(start, reading, inputs, groups, "cauchy").prior
+                result = self.solve(robust, reading, inputs, groups, "mixture")
             candidate = self._relinearised(start, result, reading, inputs, groups)
         except KineverseError:
             return []
@@ -188,7 +188,8 @@ class UpdateStep:
             # The stored measurements belong to another branch: the present residuals decide.
             candidate.nis[kept] = 0.0
             measured = [i for i, n in enumerate(self.layout.group_of) if n in kept and reading.mask[i]]
-            for i, (e, _) in self.residuals.errors(candidate.predicted, reading, measured).items():
+            out = self.residuals.evaluate(candidate.belief.x, inputs)
+            for i, (e, _) in self.residuals.errors(out, reading, measured).items():
                 candidate.nis[self.layout.group_of[i]] += e @ e
         return [candidate]
 
@@ -202,7 +203,7 @@ class UpdateStep:
     ) -> Candidate:
         self.static_batch.relinearise(old, result, reading, inputs, groups)
         _require_finite(result.belief.numbers)
-        return self._candidate(result, groups, inputs)
+        return Candidate(result.belief, result.weights, result.nis, result.dof, groups)
 
     def _forget_other_inputs(self, mixture: GaussianSum, inputs: Array) -> GaussianSum:
         def changed(belief: InformationState) -> InformationState:
@@ -216,7 +217,7 @@ class UpdateStep:
         for number in groups:
             if belief.records[number] is not None:
                 wide = belief.copy() if wide is belief else wide
-                self.inflation.inflate(number, wide)
+                self.ridge_covariance.inflate(number, wide)
         return wide
 
     def predict(
@@ -235,7 +236,7 @@ class UpdateStep:
         noise_only = [n for n in recorded if self.process_model.is_noise_only(n, speeds)]
         belief = self._inflated(belief, set(moving).difference(noise_only))
         moved = None
-        if self.native is not None and self.native.is_ready and not self.process_model.has_rates:
+        if self.native is not None and self.native.is_ready:
             tangent = self.layout.tangent_space.tangent
             motion = (np.array([by.get(v, 0.0) for v in tangent]) * dt for by in (speeds, noise))
             moved = self.native.predict(belief, *motion)
@@ -245,7 +246,7 @@ class UpdateStep:
             moved = self.constrained(moved, inputs)
         for number in noise_only:
             # A straight posterior is Gaussian; its prediction is exact.
-            if self.inflation.is_straight(number, belief):
+            if self.ridge_covariance.is_straight(number, belief):
                 moved.records[number] = None
                 continue
             group = self.layout.groups[number]
@@ -263,8 +264,7 @@ class UpdateStep:
         speeds: Speeds,
         noise: Speeds,
     ) -> InformationState:
-        inflated = set(velocity.groups) - velocity.redundant
-        result = self._inflated(belief, inflated).copy()
+        result = self._inflated(belief, set(velocity.groups) - velocity.redundant).copy()
         for number in velocity.redundant:
             result.records[number] = None
         velocity.periods = self.periods
@@ -276,17 +276,21 @@ class UpdateStep:
         return result
 
     def constrained(self, belief: InformationState, inputs: Array) -> InformationState:
-        """Return the same belief about its most probable point inside the limits."""
-        is_inside = (belief.x >= self.limits.lower).all() and (belief.x <= self.limits.upper).all()
-        if is_inside and not self.layout.limits:
+        """Return the same belief about the most probable point inside the limits."""
+        inside = np.clip(belief.x, self.limits.lower, self.limits.upper)
+        if (beyond := np.flatnonzero(inside != belief.x)).size:
+            # The model need not be finite beyond the bounds of coordinates.
+            step, tangent_space = np.zeros(len(belief.vector)), self.layout.tangent_space
+            for i in beyond.tolist():
+                direction = tangent_space.tangent.index(tangent_space.coordinates[i].derivative())
+                step[direction] = inside[i] - belief.x[i]
+            belief = belief.copy()
+            belief.vector -= belief.information @ step
+            belief.x[:] = inside
+        elif not self.layout.limits:
             if float(belief.vector @ np.linalg.solve(belief.information, belief.vector)) < _SETTLED**2:
                 return belief
-        if self.native is not None and self.native.is_ready and not self.process_model.has_rates:
-            none = np.zeros(len(belief.vector))
-            # C leaves out groups without motion; so little noise changes no number.
-            if (result := self.native.predict(belief, none, none + np.finfo(float).tiny)) is not None:
-                return result
-        return self.solver.constrain(belief, self.reader.empty(), inputs)
+        return self.solve(belief, self.reader.empty(), inputs, self._all_groups).belief
 
     def is_possible(self, number: int, belief: InformationState, inputs: Array) -> bool:
         """Return True if a group is inside its limits at a state and its model is finite there."""
@@ -300,8 +304,10 @@ class UpdateStep:
         return self.solver.group_bounds[number].rows(belief.x[group.x], out).violation < _OUTSIDE
 
     def _measured_groups(self, reading: Measurements) -> list[int]:
-        groups = enumerate(self.layout.groups)
-        return [n for n, group in groups if reading.mask[list(group.observation_indices)].any()]
+        if reading.mask.all():
+            return self._all_groups
+        counts = np.bincount(self._group_of[reading.mask], minlength=len(self.layout.groups))
+        return list(np.flatnonzero(counts).tolist())
 
     def _keep_turns(self, mixture: GaussianSum, predicted: Array) -> None:
         """Take periodic coordinates to the turn nearest to their prediction (n,), in place."""
@@ -309,33 +315,6 @@ class UpdateStep:
             i = self.layout.tangent_space.coordinates.index(x)
             for belief in mixture.beliefs:
                 belief.x[i] -= period * round((belief.x[i] - predicted[i]) / period)
-
-    def _update_mixture(self, mixture: GaussianSum, reading: Measurements, inputs: Array) -> StepResult:
-        measured = self._measured_groups(reading)
-        candidates, rounds = self._solve_inliers(mixture, reading, inputs, measured)
-        solved = {number for candidate in candidates for number in candidate.groups}
-        remaining = [number for number in measured if number not in solved]
-        for component, belief in enumerate(mixture.beliefs):
-            groups = mixture.groups(component, remaining)
-            if not groups:
-                continue
-            try:
-                new, count = self._explain(belief, reading, inputs, groups, component == 0)
-            except KineverseError:
-                # The best component must succeed; others that fail are dropped.
-                if component == 0:
-                    raise
-                continue
-            candidates += new
-            rounds = max(rounds, count)
-        should_merge = partial(self.merge_criterion.should_merge, inputs, self.periods)
-        after, best = mixture.select(candidates, should_merge)
-        nis = np.array([c.nis[n] if c else 0.0 for n, c in enumerate(best)])
-        dof = np.array([c.dof[n] if c else 0.0 for n, c in enumerate(best)])
-        weights = [None if c is None else c.weights for c in best]
-        of_group = [(i, weights[n]) for i, n in enumerate(self.layout.group_of) if reading.mask[i]]
-        rejected = [i for i, w in of_group if w is not None and w[i] < 0.5]
-        return StepResult(after, nis, dof, tuple(rejected), rounds)
 
     def restart(
         self, old: GaussianSum, initial: GaussianSum, groups: list[int], reading: Measurements, inputs: Array
@@ -376,58 +355,42 @@ class UpdateStep:
                 result[component, self.layout.group_of[i]] |= weight > 0.5
         return result
 
-    def _solve_inliers(
-        self, mixture: GaussianSum, reading: Measurements, inputs: Array, groups: list[int]
-    ) -> tuple[list[Candidate], int]:
-        if self.inlier_solver is None or not self.is_native:
-            return [], 0
-        result, rounds = self.inlier_solver.solve(mixture, reading, inputs, groups)
-        for candidate in result:
-            as_found = MapResult(candidate.belief, candidate.nis, candidate.dof, rounds, candidate.weights)
-            self.static_batch.relinearise(mixture.best, as_found, reading, inputs, candidate.groups)
-            _require_finite(candidate.belief.numbers)
-        return result, rounds
-
     def _explain(
         self, belief: InformationState, reading: Measurements, inputs: Array, groups: list[int], is_best: bool
     ) -> tuple[list[Candidate], int]:
         """Return candidates for one component: without outliers, with outliers, and all outliers."""
         if self.outliers is None:
-            results = [(belief, self._map_update(belief, reading, inputs, groups))]
+            results = [self.solve(belief, reading, inputs, groups)]
         else:
-            starts = belief, self.solver.find_robust_start(belief, reading, inputs, groups)
-            results = [(s, self.solver.update(s, reading, inputs, groups, self.outliers)) for s in starts]
-        candidates = [self._relinearised(s, result, reading, inputs, groups) for s, result in results]
-        rounds, result = max(result.rounds for _, result in results), results[-1][1]
+            robust = self.solve(belief, reading, inputs, groups, "cauchy").prior
+            results = [self.solve(start, reading, inputs, groups, "mixture") for start in (belief, robust)]
+        candidates = [self._relinearised(belief, result, reading, inputs, groups) for result in results]
+        rounds, result = max(result.rounds for result in results), results[-1]
         if is_best:
-            rejected = self._with_rejected(result, reading, groups)
-            unexplained = {*self.stationary_points.unexplained(belief, result), *rejected}
-            if again := [n for n in groups if n in unexplained]:
-                candidates += self._restart(belief, result, reading, inputs, again)
-            if self.counted:
-                turned = find_unexplained(result) if self.outliers is None else rejected
-                candidates += self._try_other_turns(belief, result, reading, inputs, turned)
+            wrong = {*self._group_of[reading.mask & (result.weights < 0.5)].tolist()}
+            rejected = [n for n in groups if n in wrong]
+            unexplained = {*self._find_unobserved(belief, result), *rejected}
+            again = [n for n in groups if n in unexplained]
+            starts = [(start, again) for start in restart_states(self, belief, result.belief, again, inputs)]
+            turned = find_unexplained(result) if self.outliers is None else rejected
+            starts += turned_states(self, belief, result.belief, reading, inputs, turned)
+            candidates += itertools.chain.from_iterable(
+                self._restart_from(start, reading, inputs, some) for start, some in starts
+            )
         if self.outliers is None:
             return candidates, rounds
-        all_outliers = belief.copy()
-        none = np.zeros(len(self.layout.groups))
-        for i in np.flatnonzero(reading.mask).tolist():
-            if self.layout.group_of[i] in groups:
-                log = self.outliers.log_density(self.layout.observations[i], float(reading.log_scale[i]))
-                all_outliers.evidence[self.layout.group_of[i]] += log
-        weights = np.zeros(len(self.layout.observations))
-        candidates.append(self._candidate(MapResult(all_outliers, none, none, 0, weights), groups, inputs))
+        all_outliers, none = belief.copy(), np.zeros(len(self.layout.groups))
+        log_density = np.where(reading.mask, self.solver.outlier_densities(reading) - reading.log_scale, 0.0)
+        for number in groups:
+            all_outliers.evidence[number] += log_density[self._group_of == number].sum()
+        candidates.append(Candidate(all_outliers, np.zeros(len(reading.mask)), none, none, groups))
         return candidates, rounds
 
-    def _with_rejected(self, result: MapResult, reading: Measurements, groups: list[int]) -> list[int]:
-        if result.weights is None:
-            return []
-        rejected = reading.mask & (result.weights < 0.5)
-        return [n for n in groups if rejected[list(self.layout.groups[n].observation_indices)].any()]
-
-    def _candidate(self, result: MapResult, groups: list[int], inputs: Array) -> Candidate:
-        predicted = self.residuals.evaluate(result.belief.x, inputs)
-        return Candidate(result.belief, predicted, result.weights, result.nis, result.dof, groups)
+    def _find_unobserved(self, before: InformationState, result: MapResult) -> list[int]:
+        """Return the groups whose residuals exceed the noise and that have unobservable directions."""
+        curved = [n for n in find_unexplained(result) if not self._is_affine[n]]
+        records, is_in = before.records, self.unobservable.is_in
+        return [n for n in curved if records[n] is not None or is_in(n, result.belief)]
 
 
 def _require_finite(*arrays: Array) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -10,13 +10,12 @@ import numpy.typing as npt
 
 from kineverse.compilation import CompiledFunction
 from kineverse.errors import InvalidValueError, ShapeError, UnknownNameError, suggest
+from kineverse.estimation.pose_checks import check_rigid
 from kineverse.expressions.expression import Expression
 from kineverse.lie import Array, inverse_right_jacobian, pose_difference, transform
 
 from .measurements import MeasurementModel, require_covariance, wrap_difference
 from .state_space import Layout
-
-RIGID = 1e-4  # largest accepted deviation of RᵀR from the identity; a pose in single precision has 1e-6
 
 
 class Measurements(NamedTuple):
@@ -45,15 +44,16 @@ class MeasurementReader:
         """Return a reading in which every observation is missing."""
         return Measurements(np.zeros(self._size), ~self._all, self._whitening, self._log_scale)
 
-    def as_values(self, predicted: Array) -> Array:
-        """Return predicted values in the layout of a reading."""
-        values = np.zeros(self._size)
-        for i, one in enumerate(self._layout.observations):
+    def as_reading(self, predicted: Array, indices: Iterable[int]) -> Measurements:
+        """Return predicted values of some observations as a reading with their usual covariances."""
+        reading = self.empty()
+        for i in indices:
             value = predicted[self._layout.value_slices[i]]
-            if one.is_pose:
+            if self._layout.observations[i].is_pose:
                 value = transform(value[:9].reshape(3, 3), value[9:]).reshape(-1)
-            values[self._layout.measurement_slices[i]] = value
-        return values
+            reading.values[self._layout.measurement_slices[i]] = value
+            reading.mask[i] = True
+        return reading
 
     def read(self, measurements: Mapping[str, Any]) -> Measurements:
         """Convert measurements by name, without :meth:`check_poses`; absent names are missing."""
@@ -133,26 +133,8 @@ class MeasurementReader:
         """Check that all measured poses are rigid."""
         for i, one in enumerate(self._layout.observations):
             if one.is_pose and reading.mask[i]:
-                check_pose(reading.values[self._layout.measurement_slices[i]].reshape(4, 4), one.label)
-
-
-def check_pose(pose: Array, label: str) -> None:
-    """Check that a 4×4 matrix is a rigid transform."""
-    if not np.isfinite(pose).all():
-        raise InvalidValueError(f"The pose of '{label}' is not finite.")
-    rotation = pose[:3, :3]
-    off = float(np.abs(rotation.T @ rotation - np.eye(3)).max())
-    if off > RIGID:
-        raise InvalidValueError(
-            f"The pose of '{label}' is not rigid: RᵀR is off from the identity by {off:.3g}."
-        )
-    if np.linalg.det(rotation) < 0:
-        raise InvalidValueError(f"The pose of '{label}' is a reflection: its rotation has determinant -1.")
-    last = float(np.abs(pose[3] - [0, 0, 0, 1]).max())
-    if last > RIGID:
-        raise InvalidValueError(
-            f"The last row of the pose of '{label}' is off from (0, 0, 0, 1) by {last:.3g}."
-        )
+                pose = reading.values[self._layout.measurement_slices[i]].reshape(1, 4, 4)
+                check_rigid(pose, f"measurement '{one.label}'")
 
 
 def read_value(value: Any, one: MeasurementModel) -> tuple[Array, Array]:

@@ -47,16 +47,14 @@ def spanning_tree(
 
 def split_tree(
     connection: frozenset[NodeT], tree: Iterable[frozenset[NodeT]]
-) -> tuple[frozenset[NodeT], frozenset[NodeT]]:
+) -> tuple[frozenset[NodeT], ...]:
     """Return the nodes on either side of a connection of a tree."""
     rest = [c for c in tree if c != connection]
-    parts = []
-    for node in connection:
-        reached = {node}
+    sides = [{node} for node in connection]
+    for reached in sides:
         while new := {n for c in rest if c & reached for n in c} - reached:
             reached |= new
-        parts.append(frozenset(reached))
-    return parts[0], parts[1]
+    return tuple(map(frozenset, sides))
 
 
 def edge_probabilities(
@@ -104,10 +102,9 @@ def replacement_probabilities(
     one, other = split_tree(connection, tree)
     around = {c: gain for c, gain in gains.items() if c <= one | other}
     missing = 1.0 - edge_probabilities(one | other, around, leaves)[connection]
-    del around[connection]
-    likely = edge_probabilities(one | other, around, leaves)
-    others = {*leaves} - connection
-    across = {c: missing * p for c, p in likely.items() if c & one and c & other and not c & others}
+    likely = edge_probabilities(one | other, {c: around[c] for c in around if c != connection}, leaves)
+    fixed = {*leaves} - connection
+    across = {c: missing * p for c, p in likely.items() if c & one and c & other and not c & fixed}
     return dict(sorted(across.items(), key=lambda pair: -pair[1]))
 
 
@@ -122,48 +119,41 @@ def _log_conductance(logs: Array, start: int, end: int) -> float:
     return float(left[0, 1])
 
 
-def tree_path(tree: Iterable[frozenset[NodeT]], start: NodeT, end: NodeT) -> list[NodeT]:
-    """Return the nodes on the path between two nodes of a tree; an empty list if they are not connected."""
-    connections = list(tree)
-    before: dict[NodeT, NodeT] = {start: start}
-    reached = [start]
-    while reached and end not in before:
-        node = reached.pop()
-        for connection in connections:
-            for neighbour in connection - {node} if node in connection else ():
-                if neighbour not in before:
-                    before[neighbour] = node
-                    reached.append(neighbour)
-    if end not in before:
-        return []
-    path = [end]
-    while path[-1] != start:
-        path.append(before[path[-1]])
-    return path[::-1]
-
-
 def orient_tree(
     first: Iterable[NodeT], nodes: Sequence[NodeT], tree: Iterable[frozenset[NodeT]]
 ) -> tuple[tuple[NodeT, ...], list[tuple[NodeT, NodeT]]]:
     """Return the roots, the first node of each component in ``first``, and the connections away from them."""
-    connections = list(tree)
+    connections, directed = set(tree), []
     roots: list[NodeT] = []
-    directed: list[tuple[NodeT, NodeT]] = []
     reached: set[NodeT] = set()
-    for node in first:
-        if node in reached:
+    for root in first:
+        if root in reached:
             continue
-        roots.append(node)
-        reached.add(node)
-        waiting = [node]
+        roots.append(root)
+        waiting = [root]
+        reached.add(root)
         while waiting:
             parent = waiting.pop(0)
-            for child in nodes:
-                if child not in reached and frozenset((parent, child)) in connections:
-                    directed.append((parent, child))
-                    reached.add(child)
-                    waiting.append(child)
+            children = [n for n in nodes if n not in reached and frozenset((parent, n)) in connections]
+            directed += [(parent, child) for child in children]
+            waiting += children
+            reached.update(children)
     return tuple(roots), directed
+
+
+def tree_path(directed: Iterable[tuple[NodeT, NodeT]], start: NodeT, end: NodeT) -> list[NodeT]:
+    """Return the nodes on the path between two nodes of a tree; an empty list if they are not connected."""
+    parents = {child: parent for parent, child in directed}
+    up, down = [start], [end]
+    for way in (up, down):
+        while way[-1] in parents:
+            way.append(parents[way[-1]])
+    if up[-1] != down[-1]:
+        return []
+    while len(up) > 1 < len(down) and up[-2] == down[-2]:
+        up.pop()
+        down.pop()
+    return up + down[-2::-1]
 
 
 @dataclass(frozen=True)
@@ -221,13 +211,10 @@ def _poses_in_first(
     """Return the poses of parts in the first, along the pairs with the largest odds of being rigid."""
     places = {parts[0]: np.eye(4)}
     tree = spanning_tree(parts, {c: p.log_odds_rigid for c, p in pairs.items() if c <= set(parts)}, points)
-    for part in parts[1:]:
-        place = np.eye(4)
-        for a, b in pairwise(tree_path(tree, parts[0], part)):
-            known = pairs[frozenset((a, b))]
-            reference = np.asarray(known.result["rigid"].parameters["reference"])
-            place = place @ (reference if known.parent == a else inverse(reference))
-        places[part] = place
+    for a, b in orient_tree(parts[:1], parts, tree)[1]:
+        known = pairs[frozenset((a, b))]
+        reference = np.asarray(known.result["rigid"].parameters["reference"])
+        places[b] = places[a] @ (reference if known.parent == a else inverse(reference))
     return places
 
 
@@ -460,9 +447,9 @@ def _find_loops(
     between: Mapping[frozenset[str], PartPair], joints: Sequence[PartPair]
 ) -> dict[frozenset[str], KinematicEdge]:
     tree = {frozenset((joint.parent, joint.child)): joint for joint in joints}
-    candidates = []
+    directed, candidates = [(joint.parent, joint.child) for joint in joints], []
     for connection, pair in between.items():
-        path = [tree[frozenset(ends)] for ends in pairwise(tree_path(tree, pair.parent, pair.child))]
+        path = [tree[frozenset(ends)] for ends in pairwise(tree_path(directed, pair.parent, pair.child))]
         if connection not in tree and path and closes_loop(pair, path):
             candidates.append(ObservedLoop(pair, path))
     loops = {}
