@@ -5,8 +5,8 @@ Errors of neighbouring rows are correlated. N rows with an autocorrelation time 
 contain the misfit of the family. The time of the most probable family is used, and the comparison is repeated
 until it agrees with the family that it makes most probable.
 
-The answer is compared with those under other assumptions: the times of other families, half and twice the
-noise, and the noise of the residuals if another one is stated. An assumption about the noise counts if the
+The answer is compared with those under other assumptions: the times of other families, twice the noise, and
+the noise of the residuals if another one is stated. An assumption about the noise counts if the
 observations are not much less probable under it than under the best of these.
 
 A joint with several joint values explains noise that is larger in one direction, such as a camera's depth,
@@ -272,7 +272,7 @@ class _Comparison:
                 other = self.assume(_largest_noise(fit).scaled(_AMPLE), best.correlation_time, rows)
                 if other.found.best.family == name:
                     yield other
-        noises = [best.noise.scaled(0.5), best.noise.scaled(2.0)]
+        noises = [best.noise.scaled(2.0)]
         if stated is not None:
             noises.append(self.assume(None, best.correlation_time, rows).noise)
         others = [self.assume(noise, best.correlation_time, rows) for noise in noises]
@@ -316,15 +316,6 @@ def _largest_noise(fit: Fit) -> ObservationNoise:
     deviations = np.sqrt(np.mean(fit.residuals[fit.inliers] ** 2, axis=0))
     orientation = float(deviations[3:].max()) if fit.rows == 6 else None
     return ObservationNoise(float(deviations[:3].max()), orientation, True)
-
-
-def residual_noise(fit: Fit) -> ObservationNoise:
-    """Return noise of the size of the residuals. Directions of joint values have none."""
-    (position, orientation), joints = fit.rms, fit.motion.joints
-    if fit.rows == 3:
-        return ObservationNoise(position / math.sqrt(max(1.0, 3.0 - joints)), None, True)
-    root = math.sqrt(max(0.5, 3.0 - 0.5 * joints))
-    return ObservationNoise(position / root, orientation / root, True)
 
 
 def log_probability(result: IdentificationResult) -> float:
