@@ -46,44 +46,23 @@ static void alone(const Problem *p, const double *joint_values, const double *re
   apart->log_likelihood = log_likelihood;
 }
 
-/* Fold products of at most eight weights into a logarithm: so many are far from what a double can hold. */
-static double logs_of(double *product) {
-  double sum = log(product[0] * product[1] * product[2]) + log(product[3] * product[4] * product[5]) +
-               log(product[6] * product[7]);
-  for (int l = 0; l < 8; l++) product[l] = 1.0;
-  return sum;
-}
-
-/* The log of the density of values around 0 at a width, with their mean integrated out; eight at once. */
+/* The log of the density of values around 0 at a width, with their mean integrated out. */
 static double density(int64_t count, const double *values, const double *variances, double width,
                       double observation_weight) {
-  double s0[8] = {0}, s1[8] = {0}, s2[8] = {0}, product[8] = {1, 1, 1, 1, 1, 1, 1, 1};
-  double square = width * width, logs = 0.0;
-  int64_t whole = count - count % 8;
-  for (int64_t i = 0; i < whole; i += 8) {
-    for (int l = 0; l < 8; l++) {
-      double weight = 1.0 / (variances[i + l] + square), pulled = weight * values[i + l];
-      s0[l] += weight;
-      s1[l] += pulled;
-      s2[l] += pulled * values[i + l];
-      product[l] *= weight;
+  double s0 = 0.0, s1 = 0.0, s2 = 0.0, product = 1.0, logs = 0.0;
+  for (int64_t i = 0; i < count; i++) {
+    double weight = 1.0 / (variances[i] + width * width), pulled = weight * values[i];
+    s0 += weight;
+    s1 += pulled;
+    s2 += pulled * values[i];
+    product *= weight;
+    if (i % 8 == 7) { /* so many are far from what a double can hold */
+      logs += log(product);
+      product = 1.0;
     }
-    if (i % 64 == 56) logs += logs_of(product);
   }
-  for (int64_t i = whole; i < count; i++) {
-    double weight = 1.0 / (variances[i] + square), pulled = weight * values[i];
-    s0[i - whole] += weight;
-    s1[i - whole] += pulled;
-    s2[i - whole] += pulled * values[i];
-    product[i - whole] *= weight;
-  }
-  logs += logs_of(product);
-  for (int l = 1; l < 8; l++) {
-    s0[0] += s0[l];
-    s1[0] += s1[l];
-    s2[0] += s2[l];
-  }
-  return 0.5 * (observation_weight * (logs - (s2[0] - s1[0] * s1[0] / s0[0])) - log(s0[0]));
+  logs += log(product);
+  return 0.5 * (observation_weight * (logs - (s2 - s1 * s1 / s0)) - log(s0));
 }
 
 /* The best width of several columns of values, and the logarithm of the mean over all of them relative to the

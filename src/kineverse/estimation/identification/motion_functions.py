@@ -45,6 +45,16 @@ class MotionFunctions:
     slope: Function | None = None  # x, a, V (K, 6), q (3,) -> gradient of <V, J_a> + <q, p> by δ and a
     prior: Function | None = None  # x -> whitened residuals r of the prior, and their derivatives (r, M)
 
+    def evaluate(self, points: Array) -> LinearisedPoses:
+        """Return the poses at states and joint values (N, ...), and their derivatives by each."""
+        (linear,) = self.linearise.batch(points)
+        count, ends = len(points), 12 + 6 * self.steps
+        poses = np.tile(np.eye(4), (count, 1, 1))
+        poses[:, :3] = linear[:, :12].reshape(count, 3, 4)
+        by_step = linear[:, 12:ends].reshape(count, self.steps, 6)
+        by_joints = linear[:, ends:].reshape(count, self.joints, 6)
+        return LinearisedPoses(poses, np.swapaxes(by_step, 1, 2), np.swapaxes(by_joints, 1, 2))
+
     def wait(self) -> None:
         """Wait until all of them are compiled, or cannot be."""
         for function in (self.linearise, self.retract, self.slope, self.prior):
@@ -188,14 +198,9 @@ class GeneratedMotion(ABC):
         problem = problem_of(form)
         if problem is not None:
             return evaluate_poses(problem, self.state, values)
-        functions, count = form.functions, len(values)
-        linear = self._batch(functions.linearise, values)
-        ends = 12 + 6 * functions.steps
-        poses = np.tile(np.eye(4), (count, 1, 1))
-        poses[:, :3] = linear[:, :12].reshape(count, 3, 4)
-        by_step = linear[:, 12:ends].reshape(count, functions.steps, 6)[:, form.parameters, : form.rows]
-        by_joint = linear[:, ends:].reshape(count, functions.joints, 6)[:, form.joints, : form.rows]
-        return LinearisedPoses(poses, by_step.transpose(0, 2, 1), by_joint.transpose(0, 2, 1))
+        linear = form.functions.evaluate(self._points(values))
+        by_parameters = linear.by_parameters[:, : form.rows, form.parameters]
+        return LinearisedPoses(linear.pose, by_parameters, linear.by_joints[:, : form.rows, form.joints])
 
     def slope(self, values: Array, gains: Array, lever: Array) -> tuple[Array, Array]:
         """Return the gradients of <V, J_a> + <q, p> by the parameters (N, n) and joint values (N, k).
@@ -206,17 +211,17 @@ class GeneratedMotion(ABC):
         weights = np.zeros((len(values), functions.joints, 6))
         weights[:, form.joints, : form.rows] = gains
         assert functions.slope is not None  # without parameters nobody asks
-        by = self._batch(functions.slope, values, weights.reshape(len(values), -1), lever)
+        points = np.concatenate([self._points(values), weights.reshape(len(values), -1), lever], axis=1)
+        by = np.asarray(functions.slope.batch(points)[0])
         return by[:, form.parameters], by[:, functions.steps + np.array(form.joints, dtype=int)]
 
-    def _batch(self, function: Function, values: Array, *others: Array) -> Array:
-        form = self.form
-        whole = np.zeros((len(values), form.functions.joints))
-        whole[:, form.joints] = values
-        (result,) = function.batch(
-            np.concatenate([np.tile(self.state, (len(values), 1)), whole, *others], axis=1)
-        )
-        return np.asarray(result)
+    def _points(self, values: Array) -> Array:
+        """Return the state and all joint values of the functions for each observation."""
+        form, state = self.form, self.state
+        points = np.zeros((len(values), len(state) + form.functions.joints))
+        points[:, : len(state)] = state
+        points[:, len(state) + np.array(form.joints, dtype=int)] = values
+        return points
 
     def retract(self, step: Array) -> Self:
         """Return the motion after a step (n,) in the parameters."""

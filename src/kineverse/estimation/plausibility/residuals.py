@@ -19,7 +19,7 @@ from kineverse.estimation.identification.motion_functions import GeneratedMotion
 from kineverse.estimation.identification.motion_model import LinearisedPoses
 from kineverse.estimation.identification.observations import Observations
 from kineverse.estimation.identification.solver import solver
-from kineverse.estimation.linear_algebra import invert_matrices, log_determinants
+from kineverse.estimation.linear_algebra import invert_matrices, log_determinants, multiply_vectors
 from kineverse.expressions.expression import array, as_expression
 from kineverse.lie import Array, pose_difference, skew
 from kineverse.model.constraint import Constraint
@@ -98,26 +98,20 @@ class KnownJoint:
             points = np.roll(points, len(self._others), axis=1)
         else:
             points = np.concatenate([points, np.zeros((len(points), self.joints))], axis=1)
-        (linear,) = self._functions.linearise.batch(points)
-        if not np.isfinite(linear).all():
-            raise NoSolutionError(
-                "A joint has no pose where it is tested: a loop of the model does not close."
-            )
-        poses = np.tile(np.eye(4), (len(points), 1, 1))
-        poses[:, :3] = linear[:, :12].reshape(-1, 3, 4)
-        twists = linear[:, 12:].reshape(len(points), self.joints, 6)
-        return LinearisedPoses(poses, np.zeros((len(points), 6, 0)), np.swapaxes(twists, 1, 2))
+        linear = self._functions.evaluate(points)
+        if not np.isfinite(linear.pose).all():
+            raise NoSolutionError("A joint has no pose there: a loop of the model does not close.")
+        return linear
 
     def retract(self, coordinates: Array, change: Array) -> Array:
         """Return coordinates (N, n) after changes of the joint values (N, k), without limits."""
-        return np.asarray(coordinates + self._per_rate(coordinates, change[:, :, None])[:, :, 0])
+        if self._rates is not None:
+            change = multiply_vectors(self._rates.batch(self._points(coordinates)), change)
+        return np.asarray(coordinates + change)
 
     def per_joint(self, coordinates: Array, slopes: Array) -> Array:
         """Convert slopes by coordinates (N, c, n) to slopes by joint values (N, c, k)."""
         return slopes if self._rates is None else slopes @ self._rates.batch(self._points(coordinates))
-
-    def _per_rate(self, coordinates: Array, change: Array) -> Array:
-        return change if self._rates is None else self._rates.batch(self._points(coordinates)) @ change
 
     def _points(self, coordinates: Array) -> Array:
         others = np.broadcast_to(self._others, (len(coordinates), len(self._others)))
