@@ -164,7 +164,7 @@ class _TestedModel:
         settings: _TestSettings,
         repaired: Iterable[JointVerdict] = (),
     ) -> None:
-        self.model, self.settings, self._repaired = model, settings, tuple(repaired)
+        self.model, self.settings = model, settings
         self.testable = find_testable_joints(model, frames, settings.relative_to)
         self.served: dict[TestableJoint, KnownJoint] = {}
         self._reasons: dict[TestableJoint, str] = {}
@@ -174,6 +174,15 @@ class _TestedModel:
             except KineverseError as error:
                 self._reasons[joint] = f"its pose cannot be computed. {error}"
         self.consistency = ConsistencyTests(model, self.served, settings.relative_to)
+        # Covariances of the displacements of joints that are replacements.
+        self._known: dict[TestableJoint, Array] = {}
+        for verdict in repaired:
+            for joint in self.served:
+                same = (verdict.tag, verdict.joint.child) == (joint.tag, joint.child)
+                if same and verdict.joint.parent == joint.parent and verdict.result is not None:
+                    if verdict.replacement == model.history.operation(joint.tag):
+                        fit, middle = verdict.result.best, self.served[joint].middle
+                        self._known[joint] = displacement_covariance(fit, middle)
 
     def is_equal(self, joint: TestableJoint, other: _TestedModel) -> bool:
         """Return True if a joint is the same in another version."""
@@ -207,29 +216,25 @@ class _TestedModel:
             except KineverseError as error:
                 self._reasons[joint] = f"its pose cannot be computed. {error}"
                 continue
-            data[joint] = JointObservations(rows + first, residuals, joint, served, poses, stamps[rows])
+            known = self._known.get(joint)
+            data[joint] = JointObservations(
+                rows + first, residuals, joint, served, poses, stamps[rows], known
+            )
         tested = self.consistency.apply(data)
         for joint, each in data.items():
             if tested[joint] is not each.residuals:
                 data[joint] = replace(each, residuals=tested[joint])
         return data
 
-    def begin_test(self, joint: TestableJoint) -> SequentialTest:
-        """Return a new test of a joint. A replacement is known with the covariance of its fit."""
-        displacement, served = None, self.model.history.operation(joint.tag)
-        for verdict in self._repaired:
-            pair = verdict.joint.parent, verdict.joint.child
-            if verdict.result is not None and pair == (joint.parent, joint.child):
-                if verdict.replacement is not None and verdict.replacement == served:
-                    displacement = displacement_covariance(verdict.result.best, self.served[joint].middle)
-        outliers = self.settings.pair_outliers(joint)
-        return SequentialTest(
-            self.settings.false_alarms, outliers.fraction if outliers else 0.0, displacement
-        )
+    def begin_test(self, data: JointObservations) -> SequentialTest:
+        """Return a new test of a joint."""
+        outliers = self.settings.pair_outliers(data.joint)
+        fraction = outliers.fraction if outliers else 0.0
+        return SequentialTest(self.settings.false_alarms, fraction, data.displacement)
 
     def test(self, data: JointObservations) -> int | None:
         """Return the first observation that a joint does not explain; None if it explains all."""
-        residuals, test = data.residuals, self.begin_test(data.joint)
+        residuals, test = data.residuals, self.begin_test(data)
         size = residuals.orthogonal.shape[1]
         looks = self.settings.correlation.measure(residuals.whitened, size, data.stamps)
         for row in zip(
@@ -403,7 +408,7 @@ class PlausibilityMonitor:
         self._last = time
         for joint, data in self._tested.observe(tracks, np.array([time]), self.count).items():
             if joint not in self._monitored:
-                test = CorrelatedTest(self._tested.begin_test(joint), self._settings.correlation)
+                test = CorrelatedTest(self._tested.begin_test(data), self._settings.correlation)
                 self._monitored[joint] = _MonitoredJoint(test, self.count)
             self._monitored[joint].test.add(data.residuals, self.count, time)
         self._recent.append(tracks)
