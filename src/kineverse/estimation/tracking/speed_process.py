@@ -32,14 +32,13 @@ from kineverse.symbols import Symbol
 
 from .information_state import InformationState
 from .process_model import ProcessModel, Speeds
+from .residuals import Residuals
 from .state_space import Layout
 
 _SETTLED = 1e-12
 _MOST_SUBSTEPS = 10
 _KNOWN = 0.5  # largest free motion that a Gaussian describes [m], [rad]
 
-Jacobian: TypeAlias = Callable[[int, Array, Array], Array]
-"""Function of the number of a group, the whole state and inputs: its whitened measurement Jacobian (d, t)."""
 Rows: TypeAlias = Callable[[Array, Array], tuple[Array, Array, Array]]
 """Function of the whole state and a group's speeds (k,): whitened errors (d,), and the Jacobians of predicted
 measurements by the state (d, t) and by the speeds (d, k)."""
@@ -70,11 +69,11 @@ class SpeedProcess:
         layout: Layout,
         process_model: ProcessModel,
         groups: Iterable[int],
-        jacobian: Jacobian,
+        residuals: Residuals,
         decay: float = math.inf,
     ) -> None:
         self._layout, self._process_model = layout, process_model
-        self._jacobian, self._decay = jacobian, decay
+        self._residuals, self._decay = residuals, decay
         self.groups = tuple(groups)
         self.periods: Mapping[Symbol, float] = {}
         self.redundant: frozenset[int] = frozenset()
@@ -97,11 +96,14 @@ class SpeedProcess:
             belief.speeds[number] = ConditionalSpeeds(belief.x[group.x].copy(), mean, gain, covariance, free)
 
     def _find_redundant(self, belief: InformationState, inputs: Array) -> Iterator[int]:
+        out = self._residuals.evaluate(belief.x, inputs)
         for number in self.groups:
+            group = self._layout.groups[number]
+            rows = np.concatenate([out[self._layout.jacobian_slices[i]] for i in group.observation_indices])
+            rows = rows.reshape(-1, len(group.t))
             # Rates and linear measurements inform about free directions over time.
             if not (self._process_model.is_carried(number) or self._layout.is_affine(number)):
-                jacobian = self._jacobian(number, belief.x, inputs)
-                if np.isfinite(jacobian).all() and np.linalg.matrix_rank(jacobian) < jacobian.shape[1]:
+                if np.isfinite(rows).all() and np.linalg.matrix_rank(rows) < len(group.t):
                     yield number
 
     def at_state(self, number: int, belief: InformationState, inputs: Array) -> ConditionalSpeeds:
