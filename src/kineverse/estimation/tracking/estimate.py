@@ -103,7 +103,7 @@ class TrackerState:
     inputs: Array
     stamp: float | None = None  # time [s]; None if unknown
     reading: Measurements | None = None  # latest measurements of this time, of each observation
-    speed_outliers: tuple[str, ...] = ()  # names of speeds that the last update rejected
+    outliers: tuple[str, ...] = ()  # names of measurements that the last update rejected
     residuals: Callable[[], dict[str, Residual]] = dict  # of the last update
 
 
@@ -128,7 +128,7 @@ class Estimate:
 
     def __init__(self, now: TrackerState, update_step: UpdateStep) -> None:
         self._mixture, self._belief, self._loss = now.mixture, now.mixture.best, now.loss
-        self._result, self._inputs, self._speed_outliers = now.result, now.inputs, now.speed_outliers
+        self._inputs, self._outliers = now.inputs, now.outliers
         self._residuals = now.residuals
         self._update_step, self._layout = update_step, update_step.layout
         self.nis, self.dof = float(now.result.nis.sum()), int(now.result.dof.sum())
@@ -190,8 +190,7 @@ class Estimate:
     @property
     def outliers(self) -> tuple[str, ...]:
         """Names of the measurements classified as outliers in the last update."""
-        names = tuple(self._layout.observations[i].name for i in self._result.outliers)
-        return (*names, *self._speed_outliers)
+        return self._outliers
 
     @cached_property
     def residuals(self) -> Mapping[str, Residual]:
@@ -221,11 +220,10 @@ class Estimate:
         """Covariance of the Gaussian, not truncated at limits, in the tangent space (t, t) [m²], [rad²]."""
         result = np.zeros_like(self._belief.information)
         for number, group in enumerate(self._layout.groups):
-            speeds, velocity = self._belief.speeds[number], self._update_step.velocity
-            if velocity and number in velocity.redundant and speeds and speeds.gain.any():
-                result[group.block] = velocity.spread(number, self._belief, self._inputs)
-            else:
-                result[group.block] = self._update_step.ridge_covariance.compute(number, self._belief)
+            block = self._update_step.ridge_covariance.compute(number, self._belief)
+            if (velocity := self._update_step.velocity) is not None:
+                block = block + velocity.free_variance(number, self._belief) * np.eye(len(block))
+            result[group.block] = block
         return result
 
     @cached_property

@@ -264,9 +264,7 @@ class UpdateStep:
         speeds: Speeds,
         noise: Speeds,
     ) -> InformationState:
-        result = self._inflated(belief, set(velocity.groups) - velocity.redundant).copy()
-        for number in velocity.redundant:
-            result.records[number] = None
+        result = self._inflated(belief, velocity.groups).copy()
         velocity.periods = self.periods
         velocity.predict(result, inputs, dt, speeds, noise)
         moments = [m for one in result.speeds if one for m in (one.mean, one.gain, one.covariance)]

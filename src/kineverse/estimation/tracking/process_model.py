@@ -12,9 +12,7 @@ import numpy as np
 
 from kineverse.compilation import compile
 from kineverse.errors import InvalidValueError, KineverseError, UnknownNameError, suggest
-from kineverse.estimation.linear_algebra import (
-    inverse_spd,
-)
+from kineverse.estimation.linear_algebra import inverse_spd
 from kineverse.expressions.expression import Expression, array, as_expression
 from kineverse.expressions.substitution import apply_substitution
 from kineverse.lie import Array

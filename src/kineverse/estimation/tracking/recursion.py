@@ -160,10 +160,9 @@ class Recursion:
             state, latest = self.advance(state, stamp, speeds, noise_now=noise_now), reading
             if state.reading is not None:
                 latest = step.reader.combine(state.reading, reading, stamp)
-        joint = self.speed_update.update(state.mixture, reading, measured_speeds, values)
-        result = step.update(joint.mixture, joint.reading, values)
-        result.nis, result.dof = result.nis + joint.nis, result.dof + joint.dof
-        result.outliers += joint.outliers
+        mixture, nis, dof, wrong = self.speed_update.update(state.mixture, reading, measured_speeds, values)
+        result = step.update(mixture, reading, values)
+        result.nis, result.dof = result.nis + nis, result.dof + dof
         has_outliers = step.outliers is not None
         refuted = find_refuted(step.layout, reading, result, has_outliers)
         loss, mixture = state.loss, result.mixture
@@ -187,13 +186,12 @@ class Recursion:
                     mixture = mixture.replace_groups(restarted.mixture, np.flatnonzero(is_found).tolist())
                 # They stay lost until measurements agree with them.
                 loss = replace(loss, refuted=np.where(is_found, 0, loss.refuted))
-        outliers: tuple[int | str, ...] = (*result.outliers, *joint.speed_outliers)
+        outliers = (*(step.layout.observations[i].name for i in result.outliers), *wrong)
+        predicted = state.mixture.best
         residuals = partial(
-            self.speed_update.residuals, state.mixture.best, reading, measured_speeds, values, outliers
+            self.speed_update.residuals, predicted, reading, measured_speeds, values, outliers
         )
-        return TrackerState(
-            mixture, result, loss, values, state.stamp, latest, joint.speed_outliers, residuals
-        )
+        return TrackerState(mixture, result, loss, values, state.stamp, latest, outliers, residuals)
 
     def read_inputs(self, last: Array, inputs: StateLike | None) -> Array:
         """Return the values of the inputs, with the last ones for those that are absent."""

@@ -236,15 +236,6 @@ class Residuals:
             pairs[i] = white @ errors[i], white @ slopes[i]
         return pairs
 
-    def group_jacobian(self, number: int, x: Array, inputs: Array) -> Array:
-        """Return the whitened Jacobian of all observations of a group at a state (d, t)."""
-        out = self.evaluate(x, inputs)
-        rows = []
-        for i in self._layout.groups[number].observation_indices:
-            slope = out[self._layout.jacobian_slices[i]].reshape(-1, self._widths[i])
-            rows.append(whitening(self._layout.observations[i].covariance) @ slope)
-        return np.concatenate(rows)
-
     def is_finite(self, out: Array, indices: Sequence[int]) -> bool:
         """Return True if values and Jacobians of observations are finite."""
         slices = self._layout.value_slices, self._layout.jacobian_slices

@@ -14,9 +14,9 @@ measurements of the state alone is exact.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 
@@ -32,19 +32,13 @@ from kineverse.symbols import Symbol
 
 from .information_state import InformationState
 from .process_model import ProcessModel, Speeds
+from .residuals import Residuals
 from .state_space import Layout
-
-if TYPE_CHECKING:
-    from .bounds import GroupBounds
 
 _SETTLED = 1e-12
 _MOST_SUBSTEPS = 10
-_RANK = 1e-9
-_LONGEST = 0.5  # [m], [rad]
-_FARTHEST, _WALK = 0.5, 4
+_KNOWN = 0.5  # largest free motion that a Gaussian describes [m], [rad]
 
-Jacobian: TypeAlias = Callable[[int, Array, Array], Array]
-"""Function of the number of a group, the whole state and inputs: its whitened measurement Jacobian (d, t)."""
 Rows: TypeAlias = Callable[[Array, Array], tuple[Array, Array, Array]]
 """Function of the whole state and a group's speeds (k,): whitened errors (d,), and the Jacobians of predicted
 measurements by the state (d, t) and by the speeds (d, k)."""
@@ -58,17 +52,16 @@ class ConditionalSpeeds:
     mean: Array  # m (k,), K (k, t) and C (k, k)
     gain: Array
     covariance: Array
-    information: Array  # of the state when it was predicted (t, t)
-    free: float = 0.0  # largest deviation of the state so far in directions that measurements leave free
+    free: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Unmeasured motion in a redundant group: variances of place and speed, their covariance between."""
 
 
 class SpeedProcess:
     """Prediction of states and speeds of some groups.
 
-    If measurements leave directions of a group free, these directions turn with the state, and information
-    about others would pass for information about them. So errors are carried along such that their measured
-    part and their free part stay what they are (Huang, Mourikis and Roumeliotis, Observability-based rules
-    for designing consistent EKF SLAM estimators, 2010).
+    Measurements leave directions of a redundant group free, such as an arm of seven joints seen at its tip.
+    These directions turn with the state, so that information about others passes for information about them.
+    Once free motion may be long, nothing is therefore stated about the coordinates of the group.
     """
 
     def __init__(
@@ -76,11 +69,11 @@ class SpeedProcess:
         layout: Layout,
         process_model: ProcessModel,
         groups: Iterable[int],
-        jacobian: Jacobian,
+        residuals: Residuals,
         decay: float = math.inf,
     ) -> None:
         self._layout, self._process_model = layout, process_model
-        self._jacobian, self._decay = jacobian, decay
+        self._residuals, self._decay = residuals, decay
         self.groups = tuple(groups)
         self.periods: Mapping[Symbol, float] = {}
         self.redundant: frozenset[int] = frozenset()
@@ -92,38 +85,26 @@ class SpeedProcess:
 
     def initialise(self, belief: InformationState, means: Speeds, variances: Speeds, inputs: Array) -> None:
         """Set the speeds of all groups, those without a mean to 0, independent of the state; in place."""
-        redundant = set()
+        self.redundant = frozenset(self._find_redundant(belief, inputs))
         for number in self.groups:
             group, speeds = self._layout.groups[number], self._process_model.speeds_of(number)
             mean, gain = np.array([means.get(v, 0.0) for v in speeds]), np.zeros((len(speeds), len(group.t)))
-            covariance, x = np.diag([variances[v] for v in speeds]), belief.x[group.x].copy()
-            belief.speeds[number] = ConditionalSpeeds(
-                x, mean, gain, covariance, belief.information[group.block]
-            )
+            covariance, free = np.diag([variances[v] for v in speeds]), (0.0, 0.0, 0.0)
+            if number in self.redundant:
+                state = inverse_spd(belief.information[group.block])
+                free = float(np.diag(state).max()), 0.0, float(np.diag(covariance).max())
+            belief.speeds[number] = ConditionalSpeeds(belief.x[group.x].copy(), mean, gain, covariance, free)
+
+    def _find_redundant(self, belief: InformationState, inputs: Array) -> Iterator[int]:
+        out = self._residuals.evaluate(belief.x, inputs)
+        for number in self.groups:
+            group = self._layout.groups[number]
+            rows = np.concatenate([out[self._layout.jacobian_slices[i]] for i in group.observation_indices])
+            rows = rows.reshape(-1, len(group.t))
             # Rates and linear measurements inform about free directions over time.
-            if self._process_model.is_carried(number) or self._layout.is_affine(number):
-                continue
-            if len(self._split(number, belief, x, inputs)[1]):
-                redundant.add(number)
-        self.redundant = frozenset(redundant)
-
-    def _split(self, number: int, belief: InformationState, x: Array, inputs: Array) -> tuple[Array, Array]:
-        """Return the measurement Jacobian of a group at a state (d, t), and its free directions (k, t)."""
-        there = belief.x.copy()
-        there[self._layout.groups[number].x] = x
-        jacobian = self._jacobian(number, there, inputs)
-        _, values, rows = np.linalg.svd(jacobian)
-        return jacobian, rows[int((values > _RANK * values.max(initial=0.0)).sum()) :]
-
-    def _carry(self, number: int, belief: InformationState, start: Array, end: Array, inputs: Array) -> Array:
-        """Return the map of errors at one state to errors at another with the same parts (t, t)."""
-        measured, free = self._split(number, belief, start, inputs)
-        measured_there, free_there = self._split(number, belief, end, inputs)
-        left, _, right = np.linalg.svd(free_there @ free.T, full_matrices=False)
-        here = np.concatenate([measured, left @ right @ free])
-        change = np.linalg.pinv(np.concatenate([measured_there, free_there])) @ here - np.eye(len(start))
-        # Near a singular state the map is unbounded.
-        return np.asarray(np.eye(len(start)) + change / max(1.0, float(np.linalg.norm(change, 2)) / _LONGEST))
+            if not (self._process_model.is_carried(number) or self._layout.is_affine(number)):
+                if np.isfinite(rows).all() and np.linalg.matrix_rank(rows) < len(group.t):
+                    yield number
 
     def at_state(self, number: int, belief: InformationState, inputs: Array) -> ConditionalSpeeds:
         """Return the speeds of a group given a step in the tangent space at its present state."""
@@ -133,111 +114,44 @@ class SpeedProcess:
         if np.array_equal(x, speeds.anchor):
             return speeds
         step, transport = self._step_between(number, speeds.anchor, x, inputs)
-        gain, information = speeds.gain, speeds.information
-        if transport is not None:
-            back = np.linalg.inv(transport)
-            gain, information = gain @ back, symmetric(back.T @ information @ back)
-        mean = speeds.mean + speeds.gain @ step
-        return replace(speeds, anchor=x.copy(), mean=mean, gain=gain, information=information)
-
-    def _realigned(self, number: int, belief: InformationState, inputs: Array) -> ConditionalSpeeds:
-        """Return the speeds at the state of a redundant group, and carry its prior there, in place."""
-        group, before = self._layout.groups[number], belief.speeds[number]
-        speeds = self.at_state(number, belief, inputs)
-        if before is None or speeds is before:
-            return speeds
-        back = np.linalg.inv(self._carry(number, belief, before.anchor, speeds.anchor, inputs))
-        mean = inverse_spd(belief.information[group.block]) @ belief.vector[group.t]
-        carried = back.T @ before.information @ back - speeds.information
-        belief.information[group.block] = symmetric(belief.information[group.block] + carried)
-        belief.vector[group.t] = belief.information[group.block] @ mean
-        forth = np.linalg.inv(back) if len(back) == len(speeds.mean) else np.eye(len(speeds.mean))
-        covariance = symmetric(forth @ speeds.covariance @ forth.T)
-        return replace(speeds, gain=forth @ before.gain @ back, covariance=covariance)
+        gain = speeds.gain if transport is None else speeds.gain @ np.linalg.inv(transport)
+        return replace(speeds, anchor=x.copy(), mean=speeds.mean + speeds.gain @ step, gain=gain)
 
     def innovate(
         self, number: int, belief: InformationState, inputs: Array, rows: Rows
-    ) -> tuple[Array, Array, Array, Array, Array]:
-        """Return slopes, by speeds and by both; innovations; mean and covariance of state and speeds."""
+    ) -> tuple[Array, Array, Array, Array]:
+        """Return innovations, their slopes by state and speeds, and mean and covariance of both."""
         group, speeds = self._layout.groups[number], self.at_state(number, belief, inputs)
         errors, by_state, by_speed = rows(belief.x, speeds.mean)
         state = inverse_spd(belief.information[group.block])
         cross, step = speeds.gain @ state, state @ belief.vector[group.t]
         joint = np.block([[state, cross.T], [cross, speeds.covariance + cross @ speeds.gain.T]])
-        slope, off = np.hstack([by_state, by_speed]), np.concatenate([step, speeds.gain @ step])
-        return by_speed, slope, errors - slope @ off, off, joint
+        slope, mean = np.hstack([by_state, by_speed]), np.concatenate([step, speeds.gain @ step])
+        return errors - slope @ mean, slope, mean, joint
 
     def measure(
-        self, number: int, belief: InformationState, inputs: Array, rows: Rows, bounds: GroupBounds
+        self, number: int, belief: InformationState, inputs: Array, rows: Rows
     ) -> tuple[Array, Array]:
-        """Update a group by measurements of states and speeds, in place; return innovations and covariance.
-
-        The update is that of a Kalman filter. A redundant group then moves along its measured directions to
-        the state with the predictions that the update demands.
-        """
+        """Update a group by measured speeds, in place; return innovations and their covariance."""
         group, speeds = self._layout.groups[number], self.at_state(number, belief, inputs)
-        by_speed, slope, errors, off, joint = self.innovate(number, belief, inputs, rows)
+        errors, slope, mean, joint = self.innovate(number, belief, inputs, rows)
         t, spread = len(group.t), np.eye(len(errors)) + slope @ joint @ slope.T
-        weights, prior = np.linalg.solve(spread, slope @ joint), joint
-        off = off + weights.T @ errors
-        joint = symmetric(joint - weights.T @ spread @ weights)
-        step, speed = off[:t], speeds.mean + off[t:]
-        anchor = speeds.anchor
-        if number in self.redundant:
-            of_state = ~by_speed.any(axis=1)
-            goal = np.linalg.solve(spread, errors)[of_state]
-            x = belief.x.copy()
-            more: Array = step
-            for _ in range(_MOST_SUBSTEPS):
-                by = more / max(1.0, float(np.abs(more).max()) / _LONGEST)
-                x[group.x] = bounds.clip(self._process_model.retract(number, x[group.x], by, inputs)[0])
-                left, jacobian, _ = rows(x, speed)
-                jacobian = jacobian[of_state]
-                gradient = jacobian.T @ (left[of_state] - goal)
-                more = np.asarray(np.linalg.solve(jacobian.T @ jacobian + np.eye(t), gradient))
-                if float(more @ more) < _SETTLED:
-                    break
-            carried, step = self._carry(number, belief, anchor, x[group.x], inputs), np.zeros(t)
-            anchor = x[group.x].copy()
-            belief.x[group.x] = anchor
-            free = self._split(number, belief, anchor, inputs)[1]
-            both, unseen = np.eye(len(joint)), np.zeros_like(joint)
-            for part in (slice(t), slice(t, None))[: 1 + (len(speed) == t)]:
-                both[part, part], unseen[part, part] = carried, free.T @ free
-            seen = np.eye(len(joint)) - unseen
-            joint = seen @ both @ joint @ both.T @ seen + unseen @ both @ prior @ both.T @ unseen
-        belief.records[number] = None
+        weights = np.linalg.solve(spread, slope @ joint)
+        mean, joint = mean + weights.T @ errors, symmetric(joint - weights.T @ spread @ weights)
         information = inverse_spd(joint[:t, :t])
         gain = joint[t:, :t] @ information
+        belief.information[group.block], belief.vector[group.t] = information, information @ mean[:t]
+        belief.records[number] = None
         covariance = symmetric(joint[t:, t:] - gain @ joint[:t, t:])
-        belief.information[group.block], belief.vector[group.t] = information, information @ step
-        mean = speed - gain @ step
-        belief.speeds[number] = ConditionalSpeeds(anchor, mean, gain, covariance, information, speeds.free)
+        speed = speeds.mean + mean[t:] - gain @ mean[:t]
+        belief.speeds[number] = replace(speeds, mean=speed, gain=gain, covariance=covariance)
         return errors, spread
 
-    def spread(self, number: int, belief: InformationState, inputs: Array) -> Array:
-        """Return the covariance of the state of a redundant group along its curved free directions (t, t).
-
-        No Gaussian describes free motion of more than ``_FARTHEST``. From then on nothing is stated about any
-        coordinate: each has the deviation of the free motion.
-        """
-        group, speeds = self._layout.groups[number], belief.speeds[number]
-        start, result = belief.x[group.x], inverse_spd(belief.information[group.block])
-        assert speeds is not None
-        if speeds.free > _FARTHEST:
-            return result + speeds.free**2 * np.eye(len(result))
-        for direction in self._split(number, belief, start, inputs)[1]:
-            length = math.sqrt(float(direction @ result @ direction))
-            for sign in (1.0, -1.0):
-                x, along, away = start, sign * direction, np.zeros(len(direction))
-                for _ in range(_WALK):
-                    step = length / _WALK * along
-                    x, away = self._process_model.retract(number, x, step, inputs)[0], away + step
-                    free = self._split(number, belief, x, inputs)[1]
-                    along = free.T @ (free @ along)
-                    along /= np.linalg.norm(along)
-                result = result + np.outer(away, away) / 2
-        return result
+    def free_variance(self, number: int, belief: InformationState) -> float:
+        """Return the variance of each coordinate of a group of which nothing can be stated; else 0."""
+        speeds = belief.speeds[number]
+        variance = 0.0 if speeds is None else speeds.free[0]
+        return variance if variance > _KNOWN**2 and speeds is not None and speeds.gain.any() else 0.0
 
     def covariance(self, number: int, belief: InformationState, inputs: Array, state: Array) -> Array:
         """Return the covariance of the speeds of a group (k, k), for a covariance of its state (t, t)."""
@@ -263,8 +177,7 @@ class SpeedProcess:
         noise: Speeds,
     ) -> None:
         groups = [self._layout.groups[n] for n in numbers]
-        at_state = [self._realigned if n in self.redundant else self.at_state for n in numbers]
-        speeds = [at(n, belief, inputs) for n, at in zip(numbers, at_state, strict=True)]
+        speeds = [self.at_state(n, belief, inputs) for n in numbers]
         t = np.array([group.t for group in groups])
         rows, columns = t[:, :, None], t[:, None, :]
         covariance = invert_matrices(belief.information[rows, columns])
@@ -288,38 +201,30 @@ class SpeedProcess:
             for n, group, by in zip(numbers, groups, speed * reaches, strict=True)
         ]
         slope, by_speed = (np.array([end[i] for end in ends]) for i in (1, 2))
-        kept = shares[:, :, None] * np.eye(density.shape[1])
-        for g, number in enumerate(numbers):
-            if number in self.redundant:
-                slope[g] = self._carry(number, belief, belief.x[groups[g].x], ends[g][0], inputs)
-                if slope.shape == by_speed.shape:
-                    by_speed[g], kept[g] = slope[g] @ by_speed[g], slope[g] @ kept[g]
-        # [ξ; u] ← [slope, moved; 0, kept] [ξ; u], with the noise of an integrated white acceleration.
+        # [ξ; u] ← [slope, moved; 0, shares] [ξ; u], with the noise of an integrated white acceleration.
         moved = by_speed * reaches[:, None, :]
         added = [integral * density[:, :, None] * np.eye(density.shape[1]) for integral in integrals]
         coupled = moved @ cross @ transposed(slope)
         state = slope @ covariance @ transposed(slope) + coupled + transposed(coupled)
         state += moved @ spread @ transposed(moved) + by_speed @ added[0] @ transposed(by_speed)
-        shared = kept @ (cross @ transposed(slope) + spread @ transposed(moved))
+        shared = shares[:, :, None] * (cross @ transposed(slope) + spread @ transposed(moved))
         shared += added[1] @ transposed(by_speed)
         information = invert_matrices(symmetric(state))
         regression, mean = shared @ information, multiply_vectors(slope, mean)
-        left = kept @ spread @ transposed(kept) + added[2]
+        left = shares[:, :, None] * spread * shares[:, None, :] + added[2]
         left = symmetric(left - regression @ transposed(shared))
         belief.information[rows, columns] = information
         belief.vector[t] = multiply_vectors(information, mean)
-        speed = multiply_vectors(kept, speed) - multiply_vectors(regression, mean)
+        speed = shares * speed - multiply_vectors(regression, mean)
         for g, (number, group) in enumerate(zip(numbers, groups, strict=True)):
             after = ends[g][0]
             belief.x[group.x] = after
-            free = speeds[g].free
-            if number in self.redundant:
-                if free > _FARTHEST:
-                    free += dt * math.sqrt(np.linalg.eigvalsh(spread[g])[-1])
-                free = max(free, math.sqrt(np.linalg.eigvalsh(state[g])[-1]))
-            belief.speeds[number] = ConditionalSpeeds(
-                after, speed[g], regression[g], left[g], information[g], free
-            )
+            a, b, c = speeds[g].free
+            if not all(v in commands for v in orders[g]):
+                q = float(density[g].max()) if number in self.redundant else 0.0
+                a, b = a + 2 * reach * b + reach**2 * c + integrals[0] * q, share * (b + reach * c)
+                b, c = b + integrals[1] * q, share**2 * c + integrals[2] * q
+            belief.speeds[number] = ConditionalSpeeds(after, speed[g], regression[g], left[g], (a, b, c))
 
     def _integrate(self, dt: float) -> tuple[float, float, tuple[float, float, float]]:
         """Return the way of a unit of speed, what is left of it, and the noise of (x, x), (x, u), (u, u)."""

@@ -1,9 +1,9 @@
-"""Measured speeds, and updates of groups whose states and speeds are measured together."""
+"""Measured speeds: their models, and updates of states and speeds together."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+import math
+from collections.abc import Collection, Iterable, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -83,20 +83,8 @@ def build_speed_models(update_step: UpdateStep, models: Iterable[MeasurementMode
     return result
 
 
-@dataclass(slots=True, eq=False)
-class JointResult:
-    """Result of an update by measured speeds, and what is left of the reading."""
-
-    mixture: GaussianSum
-    reading: Measurements
-    nis: Array  # of accepted measurements of each group
-    dof: Array
-    outliers: tuple[int, ...] = ()  # numbers of rejected observations
-    speed_outliers: tuple[str, ...] = ()  # names of rejected speeds
-
-
 class SpeedUpdate:
-    """Update by measured speeds, and by all measurements of redundant groups."""
+    """Update by measured speeds, one after the other, and residuals of all measurements."""
 
     def __init__(self, update_step: UpdateStep, models: Mapping[str, SpeedModel]) -> None:
         self._step, self.models = update_step, models
@@ -104,40 +92,62 @@ class SpeedUpdate:
     def read(self, measurements: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, SpeedValue]]:
         """Return the measurements of the state, and the checked values of speeds."""
         speeds = {}
-        for name in self.models.keys() & measurements.keys():
+        for name in [name for name in self.models if name in measurements]:
             value, covariance = read_value(measurements[name], self.models[name].model)
             speeds[name] = SpeedValue(value, whitening(covariance), log_scale(covariance))
         return {name: value for name, value in measurements.items() if name not in speeds}, speeds
 
     def update(
         self, mixture: GaussianSum, reading: Measurements, speeds: Mapping[str, SpeedValue], inputs: Array
-    ) -> JointResult:
-        """Update all components by the values of speeds, and by all measurements of redundant groups."""
-        layout, velocity = self._step.layout, self._step.velocity
-        mask, beliefs, count = reading.mask.copy(), list(mixture.beliefs), len(layout.groups)
-        result = JointResult(mixture, reading, np.zeros(count), np.zeros(count))
-        for number in () if velocity is None else velocity.groups:
-            chosen: list[int | str] = [name for name in speeds if self.models[name].number == number]
-            start = mixture.best.speeds[number]
-            if velocity and number in velocity.redundant and start is not None and start.gain.any():
-                poses = [i for i in layout.groups[number].observation_indices if reading.mask[i]]
-                mask[poses] = False
-                chosen += poses
-            for k in range(len(beliefs)) if chosen else ():
-                if not mixture.alive[k, number]:
-                    continue
-                beliefs[k], nis, dof, rejected = self._measure(
-                    number, beliefs[k], reading, speeds, chosen, inputs
-                )
-                if k == 0:
-                    result.nis[number], result.dof[number] = nis, dof
-                    result.outliers += tuple(i for i in rejected if isinstance(i, int))
-                    result.speed_outliers += tuple(i for i in rejected if isinstance(i, str))
-            if chosen and not mask[list(layout.groups[number].observation_indices)].any():
+    ) -> tuple[GaussianSum, Array, Array, tuple[str, ...]]:
+        """Update all components; return also NIS and degrees of freedom of each group, and outliers."""
+        layout, rejected = self._step.layout, []
+        nis, dof = np.zeros(len(layout.groups)), np.zeros(len(layout.groups))
+        for name, value in speeds.items():
+            number, beliefs = self.models[name].number, list(mixture.beliefs)
+            for k in np.flatnonzero(mixture.alive[:, number]).tolist():
+                beliefs[k], square = self._measure(name, value, beliefs[k], inputs)
+                if k == 0 and square is None:
+                    rejected.append(name)
+                elif k == 0 and square is not None:
+                    nis[number] += square
+                    dof[number] += len(value.value)
+            if not reading.mask[list(layout.groups[number].observation_indices)].any():
                 beliefs = [self._step.constrained(belief, inputs) for belief in beliefs]
-        result.mixture = GaussianSum(layout, beliefs, mixture.alive)
-        result.reading = reading._replace(mask=mask)
-        return result
+            mixture = GaussianSum(layout, beliefs, mixture.alive)
+        return mixture, nis, dof, tuple(rejected)
+
+    def _measure(
+        self, name: str, value: SpeedValue, belief: InformationState, inputs: Array
+    ) -> tuple[InformationState, float | None]:
+        """Return a belief after one measured speed, with its NIS; None for an outlier."""
+        outliers, velocity, one = self._step.outliers, self._step.velocity, self.models[name]
+        assert velocity is not None
+        after = belief.copy()
+        errors, spread = velocity.measure(one.number, after, inputs, self._rows(name, value, inputs))
+        square = float(errors @ np.linalg.solve(spread, errors))
+        scale = value.log_scale + float(np.linalg.slogdet(spread)[1]) / 2
+        if outliers is not None:
+            log_density = outliers.log_density(one.model, scale)
+            weight, _ = outliers.weigh(square, scale, log_density)
+            if weight < 0.5:
+                belief = belief.copy()
+                belief.evidence[one.number] += log_density
+                return belief, None
+            scale -= math.log(1 - outliers.fraction)
+        after.evidence[one.number] -= square / 2 + scale
+        return after, square
+
+    def _rows(self, name: str, measured: SpeedValue, inputs: Array) -> Rows:
+        one, group = self.models[name], self._step.layout.groups[self.models[name].number]
+
+        def evaluate(x: Array, u: Array) -> tuple[Array, Array, Array]:
+            basis = self._step.process_model.basis(one.number, x[group.x], inputs)
+            value, by_state, by_speed = one.function(np.concatenate([x[group.x], u, inputs]))
+            error = wrap_difference(measured.value - value, one.model.period)
+            return measured.white @ error, measured.white @ by_state @ basis, measured.white @ by_speed
+
+        return evaluate
 
     def residuals(
         self,
@@ -145,111 +155,29 @@ class SpeedUpdate:
         reading: Measurements,
         speeds: Mapping[str, SpeedValue],
         inputs: Array,
-        outliers: Sequence[int | str],
+        outliers: Collection[str],
     ) -> dict[str, Residual]:
         """Return the residual of each measurement by name, for the belief before the update."""
         layout, velocity = self._step.layout, self._step.velocity
+        measured = np.flatnonzero(reading.mask).tolist()
+        out = self._step.residuals.evaluate(belief.x, inputs)
+        whitened = self._step.residuals.errors(out, reading, measured)
         result: dict[str, Residual] = {}
-        for number, group in enumerate(layout.groups):
-            chosen: list[int | str] = [i for i in group.observation_indices if reading.mask[i]]
-            chosen += [name for name in speeds if self.models[name].number == number]
-            if not chosen:
-                continue
-            rows = self.rows(number, reading, speeds, chosen, inputs)
-            if velocity and number in velocity.groups:
-                _, slope, errors, _, joint = velocity.innovate(number, belief, inputs, rows)
-            else:
-                errors, slope, _ = rows(belief.x, np.empty(0))
-                joint = inverse_spd(belief.information[group.block])
-                errors = errors - slope @ (joint @ belief.vector[group.t])
-            first = 0
-            for i in chosen:
-                part = slice(first, first + self._model(i).size)
-                first = part.stop
-                spread = np.eye(part.stop - part.start) + slope[part] @ joint @ slope[part].T
-                nis = float(errors[part] @ np.linalg.solve(spread, errors[part]))
-                white = (
-                    speeds[i].white if isinstance(i, str) else reading.whitening[layout.whitening_slices[i]]
-                )
-                back = np.linalg.inv(white.reshape(len(spread), -1))
-                covariance = back @ spread @ back.T
-                result[self._model(i).name] = Residual(back @ errors[part], covariance, nis, i in outliers)
+
+        def add(name: str, error: Array, slope: Array, joint: Array, white: Array) -> None:
+            spread, back = np.eye(len(error)) + slope @ joint @ slope.T, np.linalg.inv(white)
+            nis = float(error @ np.linalg.solve(spread, error))
+            result[name] = Residual(back @ error, back @ spread @ back.T, nis, name in outliers)
+
+        for i in measured:
+            group, (error, slope) = layout.groups[layout.group_of[i]], whitened[i]
+            state = inverse_spd(belief.information[group.block])
+            white = reading.whitening[layout.whitening_slices[i]].reshape(len(error), -1)
+            error = error - slope @ state @ belief.vector[group.t]
+            add(layout.observations[i].name, error, slope, state, white)
+        for name, value in speeds.items():
+            assert velocity is not None
+            rows = self._rows(name, value, inputs)
+            error, slope, _, joint = velocity.innovate(self.models[name].number, belief, inputs, rows)
+            add(name, error, slope, joint, value.white)
         return result
-
-    def _model(self, i: int | str) -> MeasurementModel:
-        return self.models[i].model if isinstance(i, str) else self._step.layout.observations[i]
-
-    def _measure(
-        self,
-        number: int,
-        belief: InformationState,
-        reading: Measurements,
-        speeds: Mapping[str, SpeedValue],
-        chosen: Sequence[int | str],
-        inputs: Array,
-    ) -> tuple[InformationState, float, int, list[int | str]]:
-        """Update a group, without its outliers; return the NIS, its degrees of freedom, and the outliers."""
-        outliers, velocity = self._step.outliers, self._step.velocity
-        bounds = self._step.solver.group_bounds[number]
-        assert velocity is not None
-        kept, log_density = list(chosen), 0.0
-        rejected: list[int | str] = []
-        while kept:
-            after, rows = belief.copy(), self.rows(number, reading, speeds, kept, inputs)
-            errors, spread = velocity.measure(number, after, inputs, rows, bounds)
-            models = [self._model(i) for i in kept]
-            ends = np.cumsum([0, *(model.size for model in models)])
-            weights = []
-            for model, i, first, end in zip(models, kept, ends, ends[1:], strict=False):
-                part = spread[first:end, first:end]
-                scale = float(reading.log_scale[i]) if isinstance(i, int) else speeds[i].log_scale
-                scale += float(np.linalg.slogdet(part)[1]) / 2
-                square = float(errors[first:end] @ np.linalg.solve(part, errors[first:end]))
-                density = outliers.log_density(model, scale) if outliers else 0.0
-                weights.append((outliers.weigh(square, scale, density)[0] if outliers else 1.0, density))
-            worst = min(range(len(kept)), key=weights.__getitem__)
-            if weights[worst][0] >= 0.5:
-                nis = float(errors @ np.linalg.solve(spread, errors))
-                log_density -= (nis + float(np.linalg.slogdet(spread)[1])) / 2
-                log_density -= sum(
-                    float(reading.log_scale[i]) if isinstance(i, int) else speeds[i].log_scale for i in kept
-                )
-                after.evidence[number] += log_density
-                return after, nis, len(errors), rejected
-            log_density += weights[worst][1]
-            rejected.append(kept.pop(worst))
-        after = belief.copy()
-        after.evidence[number] += log_density
-        return after, 0.0, 0, rejected
-
-    def rows(
-        self,
-        number: int,
-        reading: Measurements,
-        speeds: Mapping[str, SpeedValue],
-        chosen: Sequence[int | str],
-        inputs: Array,
-    ) -> Rows:
-        """Return the function of whitened errors and Jacobians of some measurements of a group."""
-        step, group = self._step, self._step.layout.groups[number]
-        poses = [i for i in chosen if isinstance(i, int)]
-
-        def evaluate(x: Array, u: Array) -> tuple[Array, Array, Array]:
-            of_poses = (
-                step.residuals.errors(step.residuals.evaluate(x, inputs), reading, poses) if poses else {}
-            )
-            basis = step.process_model.basis(number, x[group.x], inputs)
-            parts = []
-            for i in chosen:
-                if isinstance(i, int):
-                    error, slope = of_poses[i]
-                    parts.append((error, slope, np.zeros((len(error), len(u)))))
-                    continue
-                value, by_state, by_speed = self.models[i].function(np.concatenate([x[group.x], u, inputs]))
-                error = wrap_difference(speeds[i].value - value, self.models[i].model.period)
-                white = speeds[i].white
-                parts.append((white @ error, white @ by_state @ basis, white @ by_speed))
-            errors, by_states, by_speeds = (np.concatenate(part) for part in zip(*parts, strict=True))
-            return errors, by_states, by_speeds
-
-        return evaluate

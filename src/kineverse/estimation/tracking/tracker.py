@@ -144,8 +144,8 @@ class Tracker:
         processes = choose_processes(process, process_model, layout, stated, measured)
         if groups := [n for n, each in enumerate(processes) if each == "velocity"]:
             decay = SPEED_DECAY if process is None else math.inf
-            jacobian = self._update_step.residuals.group_jacobian
-            self._update_step.velocity = SpeedProcess(layout, process_model, groups, jacobian, decay)
+            residuals = self._update_step.residuals
+            self._update_step.velocity = SpeedProcess(layout, process_model, groups, residuals, decay)
         values = np.array([np.nan if s.value is None else s.value for s in layout.inputs])
         known = np.nan_to_num(values)
         initial = InitialValues.read(self._update_step, start, uncertainty)
