@@ -5,7 +5,6 @@ from typing import TYPE_CHECKING
 from kineverse._lazy import lazy_face
 
 if TYPE_CHECKING:
-    from .joint_model import make_joint_model as make_joint_model
     from kineverse.estimation.correlation import (
         correlation_time as correlation_time,
         effective_sample_size as effective_sample_size,
@@ -17,6 +16,7 @@ if TYPE_CHECKING:
         ObservationNoise as ObservationNoise,
         RecordedJoint as RecordedJoint,
         identify_recorded_joint as identify_recorded_joint,
+        make_joint_model as make_joint_model,
     )
     from .recording import (
         RecordedPair as RecordedPair,
