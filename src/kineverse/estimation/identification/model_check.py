@@ -263,15 +263,18 @@ def _reasons(
         along = np.sort(solution.values[:, 0])
         if np.diff(along).max() > _GAP * np.ptp(along):
             yield "no pose is in its longest part, so these may be two motions, such as of swapped parts"
-        of_curve = measure_fit(solution, covariance.mean(axis=0))
-        for one in (one.scored.solution for one in solutions.values() if one is not curve):
-            ratio = math.inf
-            if one.motion.joints <= 1:
-                ratio = measure_fit(one, covariance.mean(axis=0)).factor / of_curve.factor
-            if ratio < _CORRELATED:
+        of_curve = measure_fit(solution, covariance.mean(axis=0)).factor
+        for one in solutions.values():
+            joint = one.scored.solution
+            if one is curve or joint.motion.joints > 1:
+                continue
+            ratio = measure_fit(joint, covariance.mean(axis=0)).factor / of_curve
+            if ratio < _CORRELATED or (not data.stated and max(one.noise.factors) < _STRANGE):
                 yield (
-                    f"residuals of {one.motion.name} are only {ratio:.1f} times as large, which correlated "
+                    f"residuals of {joint.motion.name} are only {ratio:.1f} times as large, which correlated "
                     "errors would explain"
+                    if ratio < _CORRELATED
+                    else f"{joint.motion.name} would fit by usual errors: state the noise"
                 )
     elif joints > 1 and curve is not None and not isinstance(solution.motion, FamilyMotion):
         fit = measure_fit(curve.scored.solution, covariance.mean(axis=0), data.observation_weight)

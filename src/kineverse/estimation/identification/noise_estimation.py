@@ -41,6 +41,7 @@ _STARTS = ((4.0, 0.25), (0.25, 4.0))
 # Least factor, 5 µm and 0.001°. Without it the likelihood of identical poses has no maximum.
 _ROUNDING = 1e-3
 _COARSE = _SPREAD * np.array([-2.0, -1.0, 0.0, 1.0, 2.0])  # logarithms of the factors of the first search
+_FAR = 0.05  # factor on a median below which a motion is solved again
 _BETTER = 0.5  # log density by which another start has to be better
 # Largest number of Newton steps, their largest length, and the step of finite differences, in deviations.
 _STEPS, _LONGEST, _DIFFERENCE = 12, 1.5, 0.5
@@ -196,6 +197,11 @@ def solve_unknown_noise(observations: Observations, solve: Callable[[Observation
         other = _NoiseSearch(observations, solution)
         if other.log_density(mode.logs[None])[0] > mode.log_density + _BETTER:
             search, mode = other, other.maximise(mode.logs, mode.root)
+    factors = _factors(mode.logs[None])[0]
+    if factors.min() < _FAR:
+        # At so much larger a noise, the priors of levers have moved the motion.
+        search = _NoiseSearch(observations, solve(scale_noise(observations, factors)).solution)
+        mode = search.maximise(mode.logs, mode.root)
     return _at_mode(search, mode)
 
 

@@ -37,6 +37,7 @@ from .e_process import CorrelatedTest, SequentialTest
 from .report import JointVerdict, Plausibility, TestableJoint, find_testable_joints
 from .residuals import KnownJoint, compute_residuals
 
+_OBSERVED, _EYE_3 = np.ones(1, dtype=bool), np.eye(3)
 FALSE_ALARMS = 1e-3  # default probability of rejecting a joint that is as served
 
 
@@ -208,7 +209,10 @@ class _TestedModel:
                 continue
             data[joint] = JointObservations(rows + first, residuals, joint, served, poses, stamps[rows])
         tested = self.consistency.apply(data)
-        return {joint: replace(each, residuals=tested[joint]) for joint, each in data.items()}
+        for joint, each in data.items():
+            if tested[joint] is not each.residuals:
+                data[joint] = replace(each, residuals=tested[joint])
+        return data
 
     def begin_test(self, joint: TestableJoint) -> SequentialTest:
         """Return a new test of a joint. A replacement is known with the covariance of its fit."""
@@ -343,6 +347,7 @@ class PlausibilityMonitor:
             false_alarms, as_outliers(outliers), relative_to, families, decorrelation_time
         )
         self._noise = noise
+        self._covariances: Array | None = None  # checked covariance of a pose without its own, (1, 6, 6)
         self._last: float | None = None
         self._recent: deque[dict[str, PoseTrack]] = deque(maxlen=keep)
         self._stamps: deque[float] = deque(maxlen=keep)
@@ -438,8 +443,14 @@ class PlausibilityMonitor:
         matrix = as_numbers(pose, f"The pose of '{name}'")
         if matrix.shape != (4, 4):
             raise ShapeError(f"The pose of '{name}' is a 4×4 transform, not of shape {matrix.shape}.")
-        track: PosesLike = (matrix[None], covariance[0]) if covariance else matrix[None]
-        return check_tracks({name: track}, self._noise)[name]
+        if not covariance and self._covariances is not None and _is_certainly_rigid(matrix):
+            # The usual case in a fraction of the time.
+            return PoseTrack(matrix[None].copy(), self._covariances, _OBSERVED)
+        given: PosesLike = (matrix[None], covariance[0]) if covariance else matrix[None]
+        track = check_tracks({name: given}, self._noise)[name]
+        if not covariance:
+            self._covariances = track.covariances
+        return track
 
     def _next_time(self, at: float | None) -> float:
         if self._last is None:
@@ -448,3 +459,14 @@ class PlausibilityMonitor:
             first = "had one" if self._settings.stamped else "had none"
             raise InvalidValueError(f"Either all observations have a time (at=), or none: the first {first}.")
         return self._last + 1.0 if at is None else _check_time(at, self._last)
+
+
+def _is_certainly_rigid(pose: Array) -> bool:
+    """Return True for a pose (4, 4) that needs no further check."""
+    rotation = pose[:3, :3]
+    return (
+        bool(np.abs(rotation.T @ rotation - _EYE_3).max() < 1e-6)
+        and float(np.linalg.det(rotation)) > 0.0
+        and pose[3].tolist() == [0.0, 0.0, 0.0, 1.0]
+        and bool(np.abs(pose[:3, 3]).max() < 1e6)
+    )

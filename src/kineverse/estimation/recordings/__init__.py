@@ -5,11 +5,6 @@ from typing import TYPE_CHECKING
 from kineverse._lazy import lazy_face
 
 if TYPE_CHECKING:
-    from kineverse.estimation.correlation import (
-        correlation_time as correlation_time,
-        effective_sample_size as effective_sample_size,
-    )
-
     from .reader import read_recording as read_recording
     from .recorded_joint import (
         Assumption as Assumption,
