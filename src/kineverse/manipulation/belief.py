@@ -234,7 +234,7 @@ class TrackedBelief:
         covariance = pose_covariance(*sensors.pose_noise(0.0, *_FLOOR))
         outliers = Outliers(min(sensors.outliers, 0.5), sensors.reach) if sensors.outliers > 0.0 else None
         observed = [ObservedPose(name, covariance=covariance) for name in self._frames]
-        tracker = Tracker(self.model, observed, outliers=outliers)
+        tracker = Tracker(self.model, observed, outliers=outliers, process="position")
         start = self.model.default_state()
         tracker.reset({s: start[s] for s in tracker.symbols})
         return tracker

@@ -322,7 +322,7 @@ def test_wrong_noise_is_refused(model):
     for wrong in (np.nan, -1.0):
         bad = good.copy()
         bad[1, 2, 2] = wrong
-        with pytest.raises(InvalidValueError, match="covariance of 'right_leaf'"):
+        with pytest.raises(InvalidValueError, match="observation 'right_leaf'"):
             tracker.update_poses(poses, covariances=bad)
     with pytest.raises(InvalidValueError, match=r"process_noise= need the time"):
         tracker.update_poses(poses, process_noise={"left": 0.1})

@@ -64,13 +64,13 @@ def test_a_group_that_jumped_is_lost_and_then_found(process, outliers):
     for k in range(30, 50):
         estimate = tracker.update(observer({"q": 1.2, "d": 0.2}), at=k / 30)
         flags.append(estimate.lost)
-        assert estimate.lost or abs(estimate.state["q"] - 1.2) < 0.1 or k < 34
+        # Two rejections in a row are a motion, of both markers.
+        assert estimate.lost or abs(estimate.state["q"] - 1.2) < 0.1 or k < (31 if outliers else 34)
         assert all(str(group[0]) == "q" for group in estimate.lost_groups)
     assert not flags[-1]
     assert estimate.state["q"] == pytest.approx(1.2, abs=0.05)
     assert estimate.state["d"] == pytest.approx(0.2, abs=0.02)
-    if outliers and process == "static":
-        assert any(flags)
+    assert not (outliers and any(flags))
 
 
 def test_without_restarts_a_lost_group_stays_lost_and_says_so():
@@ -82,10 +82,10 @@ def test_without_restarts_a_lost_group_stays_lost_and_says_so():
         estimate = tracker.update(observer({"q": 1.2}))
         assert estimate.lost is (k >= 2)
     assert estimate.state["q"] == pytest.approx(0.1, abs=0.02)
-    # Observations count, also if they were rejected.
     assert estimate.outliers == ("handle",)
-    assert estimate.dof == 6
-    assert estimate.nis > 1000
+    assert estimate.dof == estimate.nis == 0
+    assert estimate.residuals["handle"].nis > 1000
+    assert estimate.residuals["handle"].is_outlier
 
 
 def test_a_wrong_model_stays_lost():
@@ -104,7 +104,7 @@ def test_outliers_alone_are_no_track():
     model, rng = kv.Model(), np.random.default_rng(0)
     with model.edit() as edit:
         edit.apply(kv.Floating(name="box", parent="world", child="box"))
-    tracker, lost = Tracker(model, ["box"], outliers=True), []
+    tracker, lost = Tracker(model, ["box"], process="position", outliers=True), []
     for k in range(25):
         pose = kv.axis_angle(rng.standard_normal(3), rng.uniform(0, 3))()
         pose[:3, 3] = rng.uniform(-1, 1, 3)
@@ -283,15 +283,13 @@ def test_a_free_body_that_jumped_is_found_again():
     model = kv.Model()
     with model.edit() as edit:
         edit.apply(kv.Floating(name="box", parent="world", child="box"))
-    tracker, rng, lost = Tracker(model, ["box"], outliers=True), np.random.default_rng(0), []
+    tracker, rng = Tracker(model, ["box"], outliers=True), np.random.default_rng(0)
     for k in range(40):
         pose = kv.rotation_x(2.5 * (k >= 20))()
         pose[:3, 3] = (3.0 * (k >= 20), 0, 0) + 0.005 * rng.standard_normal(3)
         estimate = tracker.update({"box": pose}, at=k / 30)
-        lost.append(estimate.lost)
-    assert 1 <= sum(lost) <= 4
-    assert not lost[-1]
-    assert estimate.state["box/x"] == pytest.approx(3.0, abs=0.02)
+        if k >= 22:
+            assert estimate.state["box/x"] == pytest.approx(3.0, abs=0.02)
 
 
 def test_late_measurements_repeat_all_that_happened():

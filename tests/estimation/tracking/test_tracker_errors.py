@@ -56,11 +56,11 @@ def broken(model, **entries):
         (lambda m: {DOOR: "here"}, "no numbers"),
         (lambda m: {DOOR: pose(m) * (1 + 0j)}, "no numbers"),
         (lambda m: {"kitchen/fridge_dor": np.eye(4)}, "fridge_dor' is not observed. Did you mean"),
-        (lambda m: {DOOR: (pose(m), -np.eye(6))}, "covariance of 'kitchen/fridge_door' is not positive"),
+        (lambda m: {DOOR: (pose(m), -np.eye(6))}, "observation 'kitchen/fridge_door' is not positive"),
         (lambda m: {DOOR: (pose(m), np.zeros((6, 6)))}, "is not positive"),
         (lambda m: {DOOR: (pose(m), np.full((6, 6), np.nan))}, "is not finite"),
         (lambda m: {DOOR: (pose(m), np.triu(np.ones((6, 6))))}, "is not symmetric"),
-        (lambda m: {DOOR: (pose(m), np.eye(3))}, "6×6"),
+        (lambda m: {DOOR: (pose(m), np.eye(3))}, r"shape \(6, 6\)"),
         (lambda m: [pose(m)], "a mapping"),
     ],
 )

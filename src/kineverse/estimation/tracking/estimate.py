@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from types import MappingProxyType
+from typing import TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -21,29 +22,46 @@ from kineverse.symbols import Symbol
 from .gaussian_sum import GaussianSum
 from .gaussian_sum_filter import StepResult, UpdateStep
 from .residuals import Measurements
+from .speed_update import Residual, SpeedValue
 from .state_space import Layout
 
 Groups = npt.NDArray[np.bool_]
+RecentReading: TypeAlias = tuple[float | None, Measurements, Array, Mapping[str, SpeedValue]]
+"""Time, measurements of the state, inputs, and measured speeds of an update."""
 
 _QUANTILE = 4.753  # quantile of the standard normal distribution that is exceeded once in a million
 
 
 @dataclass(frozen=True, eq=False)
 class TrackLoss:
-    """Refuted updates of each group."""
+    """Rejected measurements and refuted updates in a row."""
 
+    rejected: npt.NDArray[np.int64]  # number of times in a row that each observation was rejected (m,)
     refuted: npt.NDArray[np.int64]  # number of updates in a row that refute the estimate (groups,)
     is_lost: Groups  # True for each lost group (groups,)
 
-    @cached_property
-    def is_clear(self) -> bool:
-        """True if no group is lost or refuted."""
-        return not (self.refuted.any() or self.is_lost.any())
-
-    def after(self, measured: Groups, refuted: Groups, lost_after: int) -> TrackLoss:
+    def after(
+        self, layout: Layout, reading: Measurements, outliers: Sequence[int], refuted: Groups, lost_after: int
+    ) -> TrackLoss:
         """Return the state after an update; a lost group stays lost until measurements agree with it."""
+        rejected, measured = self.rejected, find_measured(layout, reading)
+        if outliers or rejected.any():
+            rejected = np.where(reading.mask, 0, rejected)
+            rejected[list(outliers)] = self.rejected[list(outliers)] + 1
         count = np.where(measured, np.where(refuted, self.refuted + 1, 0), self.refuted)
-        return TrackLoss(count, (self.is_lost | (count >= lost_after)) & (refuted | ~measured))
+        is_lost = (self.is_lost | (count >= lost_after)) & (refuted | ~measured)
+        return TrackLoss(rejected, count, is_lost)
+
+    def find_due(self, layout: Layout, outliers: Sequence[int], lost_after: int) -> Groups:
+        """Return True for each group that may have moved, since it contradicts the latest looks (groups,).
+
+        A second rejection in a row is hardly an error again. Later ones are tried less often.
+        """
+        result = np.zeros(len(layout.groups), dtype=bool)
+        for i in outliers:
+            count = int(self.rejected[i])
+            result[layout.group_of[i]] |= count % (2 if count < lost_after else lost_after) == 0
+        return result
 
 
 def find_measured(layout: Layout, reading: Measurements) -> Groups:
@@ -85,6 +103,8 @@ class TrackerState:
     inputs: Array
     stamp: float | None = None  # time [s]; None if unknown
     reading: Measurements | None = None  # latest measurements of this time, of each observation
+    outliers: tuple[str, ...] = ()  # names of measurements that the last update rejected
+    residuals: Callable[[], dict[str, Residual]] = dict  # of the last update
 
 
 class Estimate:
@@ -98,9 +118,8 @@ class Estimate:
     Attributes
     ----------
     nis, dof
-        Normalised innovation squared of the last update over all measurements, and its degrees of freedom.
-        It is χ² distributed if the noise is as the covariances say. A rejected measurement adds the square of
-        its residual.
+        Normalised innovation squared of the inliers of the last update, and its degrees of freedom. It is χ²
+        distributed if the noise is as the covariances say.
     rounds
         Number of model evaluations; at 50 the iteration stopped without convergence.
     stamp
@@ -109,7 +128,8 @@ class Estimate:
 
     def __init__(self, now: TrackerState, update_step: UpdateStep) -> None:
         self._mixture, self._belief, self._loss = now.mixture, now.mixture.best, now.loss
-        self._result, self._inputs = now.result, now.inputs
+        self._inputs, self._outliers = now.inputs, now.outliers
+        self._residuals = now.residuals
         self._update_step, self._layout = update_step, update_step.layout
         self.nis, self.dof = float(now.result.nis.sum()), int(now.result.dof.sum())
         self.rounds, self.stamp = now.result.rounds, now.stamp
@@ -125,7 +145,7 @@ class Estimate:
         """Speeds by symbol [m/s], [rad/s]; empty if none are estimated."""
         result: dict[Symbol, float] = {}
         if (velocity := self._update_step.velocity) is not None:
-            for number in range(len(self._layout.groups)):
+            for number in velocity.groups:
                 means = velocity.at_state(number, self._belief, self._inputs).mean.tolist()
                 result |= zip(self._update_step.process_model.speeds_of(number), means, strict=True)
         return MappingProxyType(result)
@@ -135,8 +155,8 @@ class Estimate:
         """Covariance of :attr:`speeds`, in their order (k, k) [m²/s²], [rad²/s²]."""
         blocks = [np.zeros((0, 0))]
         if (velocity := self._update_step.velocity) is not None:
-            for number, group in enumerate(self._layout.groups):
-                state = self.covariance[group.block]
+            for number in velocity.groups:
+                state = self.covariance[self._layout.groups[number].block]
                 blocks.append(velocity.covariance(number, self._belief, self._inputs, state))
         size = sum(map(len, blocks))
         result, at = np.zeros((size, size)), 0
@@ -170,7 +190,16 @@ class Estimate:
     @property
     def outliers(self) -> tuple[str, ...]:
         """Names of the measurements classified as outliers in the last update."""
-        return tuple(self._layout.observations[i].name for i in self._result.outliers)
+        return self._outliers
+
+    @cached_property
+    def residuals(self) -> Mapping[str, Residual]:
+        """Residual of each measurement of the last update, by name: measured minus predicted.
+
+        ``residuals[name]`` has its ``value``, its ``covariance``, its normalised square ``nis``, and
+        ``is_outlier``.
+        """
+        return MappingProxyType(self._residuals())
 
     @property
     def tangent(self) -> tuple[Symbol, ...]:
@@ -191,7 +220,10 @@ class Estimate:
         """Covariance of the Gaussian, not truncated at limits, in the tangent space (t, t) [m²], [rad²]."""
         result = np.zeros_like(self._belief.information)
         for number, group in enumerate(self._layout.groups):
-            result[group.block] = self._update_step.ridge_covariance.compute(number, self._belief)
+            block = self._update_step.ridge_covariance.compute(number, self._belief)
+            if (velocity := self._update_step.velocity) is not None:
+                block = block + velocity.free_variance(number, self._belief) * np.eye(len(block))
+            result[group.block] = block
         return result
 
     @cached_property
@@ -250,25 +282,23 @@ class RecentPoses:
     times: Array | None  # (N,) [s]; None if they have none
 
 
-def collect_recent_poses(
-    model: ModelView, layout: Layout, readings: Sequence[tuple[float | None, Measurements, Array]]
-) -> RecentPoses:
+def collect_recent_poses(model: ModelView, layout: Layout, readings: Sequence[RecentReading]) -> RecentPoses:
     """Return the poses of readings with their times, of the first observer among the observations."""
     poses = {i: one for i, one in enumerate(layout.observations) if one.is_pose}
     observer = next((one.relative_to for one in poses.values()), "")
-    has_times = all(stamp is not None for stamp, _, _ in readings)
-    stamps = [stamp if has_times else k for k, (stamp, _, _) in enumerate(readings)]
+    has_times = all(stamp is not None for stamp, *_ in readings)
+    stamps = [stamp if has_times else k for k, (stamp, *_) in enumerate(readings)]
     # Readings of one time are one row.
     times, rows = np.unique(np.array(stamps, dtype=float), return_inverse=True)
     measured, covariances = {}, {}
     inputs = np.zeros((len(times), len(layout.inputs)))
-    for row, (_, _, values) in zip(rows.tolist(), readings, strict=True):
+    for row, (_, _, values, _) in zip(rows.tolist(), readings, strict=True):
         inputs[row] = values
     for i, one in poses.items():
         if one.relative_to == observer:
             measured[one.frame] = np.full((len(times), 4, 4), np.nan)
             weights = []
-            for row, (_, reading, _) in zip(rows.tolist(), readings, strict=True):
+            for row, (_, reading, *_) in zip(rows.tolist(), readings, strict=True):
                 if reading.mask[i]:
                     measured[one.frame][row] = reading.values[layout.measurement_slices[i]].reshape(4, 4)
                     weights.append(reading.whitening[layout.whitening_slices[i]].reshape(6, 6))

@@ -104,6 +104,16 @@ class GaussianSum:
             sources[number] = other
         return self._assemble([source.components(number) for number, source in enumerate(sources)])
 
+    def join(self, other: GaussianSum, chosen: npt.NDArray[np.bool_]) -> GaussianSum:
+        """Return this sum with chosen components of another one (components, groups), if probable."""
+        components = [self.components(number) for number in range(len(self._layout.groups))]
+        for n in np.flatnonzero(chosen.any(axis=0)).tolist():
+            more = [other.beliefs[k] for k in np.flatnonzero(chosen[:, n] & other.alive[:, n]).tolist()]
+            ranked = sorted(components[n] + more, key=lambda b: -float(b.evidence[n]))
+            least = ranked[0].evidence[n] - PRUNING_LOG_RATIO
+            components[n] = [b for b in ranked if b.evidence[n] >= least][:MOST_COMPONENTS]
+        return self._assemble(components)
+
     def _assemble(self, components: Sequence[Sequence[InformationState]]) -> GaussianSum:
         beliefs, alive = [], []
         for k in range(max(map(len, components))):

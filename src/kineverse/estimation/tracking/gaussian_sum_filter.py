@@ -28,8 +28,9 @@ from .observability import (
     restart_states,
     turned_states,
 )
-from .process_model import ConstantVelocity, ProcessModel, Speeds
+from .process_model import ProcessModel, Speeds
 from .residuals import MeasurementReader, Measurements, Residuals
+from .speed_process import SpeedProcess
 from .state_space import Layout
 
 
@@ -39,7 +40,7 @@ class StepResult:
 
     mixture: GaussianSum  # gaussian sum after the update
     nis: Array  # normalised innovation squared of each group
-    dof: Array  # its degrees of freedom. Rejected measurements count with their residuals
+    dof: Array  # its degrees of freedom, without rejected measurements
     outliers: tuple[int, ...]  # numbers of the observations with an inlier probability below one half
     rounds: int  # number of model evaluations, the largest of all candidates
 
@@ -53,14 +54,12 @@ _SETTLED = 1e-5  # a belief closer to its mean, in deviations, is about its mean
 class UpdateStep:
     """Prediction and update of all components of a tracker."""
 
-    def __init__(
-        self, layout: Layout, limits: StateBounds, outliers: Outliers | None, has_speeds: bool = False
-    ) -> None:
+    def __init__(self, layout: Layout, limits: StateBounds, outliers: Outliers | None) -> None:
         self.layout, self.limits, self.outliers = layout, limits, outliers
         self._group_of, self._all_groups = np.array(layout.group_of), list(range(len(layout.groups)))
         self.function = layout.compile_function()
         self.process_model = ProcessModel(layout)
-        self.velocity = ConstantVelocity(layout, self.process_model) if has_speeds else None
+        self.velocity: SpeedProcess | None = None
         self.residuals = Residuals(layout, self.function)
         self.reader = MeasurementReader(layout)
         self.solver = MapSolver(layout, self.residuals, self.process_model, limits, outliers)
@@ -118,11 +117,6 @@ class UpdateStep:
         dof = np.array([c.dof[n] if c else 0.0 for n, c in enumerate(best)])
         of_group = [(i, best[n]) for i, n in enumerate(self.layout.group_of) if reading.mask[i]]
         rejected = [i for i, candidate in of_group if candidate is not None and candidate.weights[i] < 0.5]
-        if rejected and self.outliers is not None:
-            out = self.residuals.evaluate(after.best.x, inputs)
-            for i, (error, _) in self.residuals.errors(out, reading, rejected).items():
-                nis[self.layout.group_of[i]] += error @ error
-                dof[self.layout.group_of[i]] += len(error)
         return StepResult(after, nis, dof, tuple(rejected), rounds)
 
     def solve(
@@ -231,14 +225,12 @@ class UpdateStep:
     ) -> InformationState:
         """Predict a belief by ``dt`` seconds; it stays about the most probable point inside the limits."""
         if self.velocity is not None:
-            result = self._inflated(belief, range(len(self.layout.groups))).copy()
-            self.velocity.periods = self.periods
-            self.velocity.predict(result, inputs, dt, speeds, noise)
-            moments = [m for one in result.speeds if one for m in (one.mean, one.gain, one.covariance)]
-            _require_finite(result.numbers, *moments)
-            result = self.constrained(result, inputs)
-            _require_finite(result.numbers)
-            return result
+            belief = self._predict_speeds(self.velocity, belief, inputs, dt, speeds, noise)
+            if len(self.velocity.groups) == len(self.layout.groups):
+                return belief
+            estimated = {v for n in self.velocity.groups for v in self.process_model.speeds_of(n)}
+            speeds = {v: speed for v, speed in speeds.items() if v not in estimated}
+            noise = {v: q for v, q in noise.items() if v not in estimated}
         moving = self.process_model.find_moving_groups(speeds, noise)
         recorded = [n for n in moving if belief.records[n] is not None]
         noise_only = [n for n in recorded if self.process_model.is_noise_only(n, speeds)]
@@ -262,6 +254,24 @@ class UpdateStep:
             self.static_batch.add_noise(number, belief, moved, added_variance)
         _require_finite(moved.numbers)
         return moved
+
+    def _predict_speeds(
+        self,
+        velocity: SpeedProcess,
+        belief: InformationState,
+        inputs: Array,
+        dt: float,
+        speeds: Speeds,
+        noise: Speeds,
+    ) -> InformationState:
+        result = self._inflated(belief, velocity.groups).copy()
+        velocity.periods = self.periods
+        velocity.predict(result, inputs, dt, speeds, noise)
+        moments = [m for one in result.speeds if one for m in (one.mean, one.gain, one.covariance)]
+        _require_finite(result.numbers, *moments)
+        result = self.constrained(result, inputs)
+        _require_finite(result.numbers)
+        return result
 
     def constrained(self, belief: InformationState, inputs: Array) -> InformationState:
         """Return the same belief about the most probable point inside the limits."""
@@ -307,9 +317,13 @@ class UpdateStep:
     def restart(
         self, old: GaussianSum, initial: GaussianSum, groups: list[int], reading: Measurements, inputs: Array
     ) -> StepResult:
-        """Return the result of a reading of some groups that restart; they keep their evidence."""
+        """Return the result of a reading of some groups that restart; they keep their evidence.
+
+        With outliers, an unexpected motion is taken to be as probable as a gross error.
+        """
         mask = reading.mask & np.isin(self.layout.group_of, groups)
-        evidence = {n: float(np.logaddexp.reduce(old.evidence(n))) for n in groups}
+        log_prior = math.log(self.outliers.fraction) if self.outliers else 0.0
+        evidence = {n: log_prior + float(np.logaddexp.reduce(old.evidence(n))) for n in groups}
 
         def with_evidence(belief: InformationState) -> InformationState:
             result = belief.copy()
@@ -325,8 +339,8 @@ class UpdateStep:
     def find_accepted(
         self, mixture: GaussianSum, reading: Measurements, inputs: Array
     ) -> npt.NDArray[np.bool_]:
-        """Return True for each group of which a component, best or not, accepts a measurement (groups,)."""
-        result = np.zeros(len(self.layout.groups), dtype=bool)
+        """Return True where a component of a group accepts a measurement (components, groups)."""
+        result = np.zeros((len(mixture.beliefs), len(self.layout.groups)), dtype=bool)
         assert self.outliers is not None
         for component, belief in enumerate(mixture.beliefs):
             groups = mixture.groups(component, self._measured_groups(reading))
@@ -336,7 +350,7 @@ class UpdateStep:
                 scale = float(reading.log_scale[i])
                 log_density = self.outliers.log_density(self.layout.observations[i], scale)
                 weight, _ = self.outliers.weigh(float(error @ error), scale, log_density)
-                result[self.layout.group_of[i]] |= weight > 0.5
+                result[component, self.layout.group_of[i]] |= weight > 0.5
         return result
 
     def _explain(

@@ -15,7 +15,7 @@ from kineverse.lie import Array
 
 if TYPE_CHECKING:
     from .observability import StaticRecord
-    from .process_model import ConditionalSpeeds
+    from .speed_process import ConditionalSpeeds
 
 TangentIndices = npt.NDArray[np.int64]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -113,7 +113,7 @@ def spread_starts(update_step: UpdateStep, first: InformationState, inputs: Arra
         offsets += [math.pi * np.eye(len(group.tangent))[k] for k in group.rate_directions]
         component = 0
         for offset in offsets:
-            if np.abs(offset / update_step.unobservable.deviations[group.t]).max() > _FARTHEST:
+            if float(offset**2 @ np.diag(first.information)[group.t]) > _FARTHEST**2:
                 continue
             x, transport = update_step.process_model.retract(number, first.x[group.x], offset, inputs)
             there = first.copy()
@@ -198,8 +198,24 @@ class InitialBelief:
 
     x: Array  # coordinates (n,)
     deviations: Array  # standard deviation of each tangent direction (t,)
+    widest: Array  # deviations of what is known of the model alone, the limits or the room (t,)
     speeds: Mapping[Symbol, float] = field(default_factory=dict)
     speed_variances: Mapping[Symbol, float] = field(default_factory=dict)
+
+    def moved(self, update_step: UpdateStep, x: Array, noise: Mapping[Symbol, float]) -> InitialBelief:
+        """Return the belief about what was at x (n,) and may have moved by any distance since."""
+        after, deviations, limits = self.x.copy(), self.deviations.copy(), update_step.limits
+        for number, group in enumerate(update_step.layout.groups):
+            speeds = update_step.process_model.speeds_of(number)
+            is_carried = update_step.process_model.is_carried(number) and any(noise.get(v) for v in speeds)
+            for k, v in zip(group.t.tolist(), group.tangent, strict=True):
+                if is_carried or noise.get(v):
+                    deviations[k] = max(deviations[k], self.widest[k])
+            is_moving = [is_carried or bool(noise.get(s.derivative())) for s in group.coordinates]
+            after[group.x[is_moving]] = x[group.x[is_moving]]
+        middle = np.isfinite(limits.upper - limits.lower) & (after != self.x)
+        after[middle] = (limits.lower[middle] + limits.upper[middle]) / 2
+        return replace(self, x=after, deviations=deviations)
 
     def spread(self, update_step: UpdateStep, inputs: Array) -> GaussianSum:
         """Return the belief about several initial points."""
@@ -211,7 +227,7 @@ class InitialBelief:
             raise InvalidValueError("An initial uncertainty is too large or too small for floating point.")
         belief.information[:] = np.diag(self.deviations**-2.0)
         if update_step.velocity is not None:
-            update_step.velocity.initialise(belief, self.speeds, self.speed_variances)
+            update_step.velocity.initialise(belief, self.speeds, self.speed_variances, inputs)
         return spread_starts(update_step, belief, inputs)
 
     def with_values(self, update_step: UpdateStep, values: InitialValues) -> InitialBelief:
@@ -224,7 +240,7 @@ class InitialBelief:
             deviations[k] = value
         variances = {v: deviation**2 for v, deviation in values.speed_deviations.items()}
         speeds, speed_variances = {**self.speeds, **values.speeds}, {**self.speed_variances, **variances}
-        return InitialBelief(x, deviations, speeds, speed_variances)
+        return InitialBelief(x, deviations, self.widest, speeds, speed_variances)
 
 
 @dataclass(frozen=True, eq=False)
@@ -242,7 +258,8 @@ class InitialValues:
     ) -> InitialValues:
         """Check initial values and standard deviations."""
         tangent_space, limits = update_step.layout.tangent_space, update_step.limits
-        speeds = () if update_step.velocity is None else tuple(update_step.process_model.speeds.values())
+        velocity, speeds_of = update_step.velocity, update_step.process_model.speeds_of
+        speeds = [v for number in velocity.groups for v in speeds_of(number)] if velocity else []
         state = start if isinstance(start, State) else State({} if start is None else start)
         values = {s: state[s] for s in (*tangent_space.coordinates, *speeds) if s in state}
         for name in () if isinstance(start, State) else state:
@@ -289,6 +306,6 @@ def make_initial_belief(
     x = initial_point(model, tangent_space, limits, values.coordinates)
     update_step.periods, update_step.counted = find_turning_coordinates(update_step, x, inputs)
     usual = initial_deviations(tangent_space, limits, update_step.periodic)
-    belief = InitialBelief(x, usual).with_values(update_step, values)
+    belief = InitialBelief(x, usual, usual).with_values(update_step, values)
     update_step.unobservable.deviations = belief.deviations
     return belief

@@ -13,6 +13,7 @@ import numpy.typing as npt
 from kineverse._checks import finite_number
 from kineverse.errors import DuplicateNameError, InvalidValueError, ShapeError
 from kineverse.estimation.noise import pose_covariance
+from kineverse.estimation.pose_checks import as_numbers, check_covariance
 from kineverse.expressions.expression import Expression, array
 from kineverse.lie import Array
 from kineverse.model.frame import WORLD
@@ -42,8 +43,8 @@ class ObservedPose(_Observed):
     relative_to
         Observing frame: the world, or a camera, which may move.
     covariance
-        6×6, of the errors in the axes of ``relative_to``, linear part first [m²], [rad²]; by default 1 cm and
-        1°. See :func:`.pose_covariance`.
+        6×6, of the errors in the axes of ``relative_to``, linear part first [m²], [rad²], its diagonal, or a
+        pair of standard deviations [m], [rad]; by default 1 cm and 1°. See :func:`.pose_covariance`.
     name
         Key of its measurements; the name of the frame if empty.
     """
@@ -73,7 +74,7 @@ class ObservedPosition(_Observed):
 
 @dataclass(frozen=True, eq=False)
 class ObservedExpression:
-    """Observed expression of coordinates, a scalar or a vector.
+    """Observed expression of coordinates, or of speeds, a scalar or a vector.
 
     Attributes
     ----------
@@ -185,28 +186,10 @@ def wrap_difference(difference: Array, period: float) -> Array:
 
 
 def require_covariance(covariance: npt.ArrayLike, size: int, label: str) -> Array:
-    """Check a covariance, size × size."""
-    try:
-        matrix = np.array(covariance, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise InvalidValueError(f"The covariance of '{label}' is not a matrix: {covariance!r:.80}.") from None
-    if matrix.shape == () and size == 1:
-        matrix = matrix.reshape(1, 1)
-    if matrix.shape != (size, size):
-        raise ShapeError(f"The covariance of '{label}' is {size}×{size}, not of shape {matrix.shape}.")
-    if not np.isfinite(matrix).all():
-        raise InvalidValueError(f"The covariance of '{label}' is not finite.")
-    off = float(np.abs(matrix - matrix.T).max())
-    if off > 1e-9 * float(np.abs(matrix).max()):
-        raise InvalidValueError(f"The covariance of '{label}' is not symmetric: it is off by {off:.3g}.")
-    matrix = (matrix + matrix.T) / 2
-    least = float(np.linalg.eigvalsh(matrix)[0])
-    if least <= 0:
-        raise InvalidValueError(
-            f"The covariance of '{label}' is not positive: its least eigenvalue is {least:.3g}. Known "
-            "values are inputs=; leave out what is not measured."
-        )
-    return matrix
+    """Check a covariance, size × size, or one of its short forms; see :mod:`.pose_checks`."""
+    part = f"observation '{label}'"
+    matrix = as_numbers(covariance, f"The covariance of the {part}")
+    return check_covariance(matrix.reshape(1, 1) if matrix.size == size == 1 else matrix, size, part, 0.0)
 
 
 def require_mapping(values: Any, label: str) -> Mapping[Any, Any]:

@@ -1,33 +1,18 @@
-"""Process models: prediction along q̇ = R(q) u, constant velocity, default process noise.
-
-With constant velocity, the acceleration is white noise with the spectral density q (Bar-Shalom, Li and
-Kirubarajan, Estimation with Applications to Tracking and Navigation, 2001, 6.2.2):
-
-    ẋ = R(x) u,    u̇ = w,    Cov ∫ w dt = q dt
-
-No measurement depends on speeds. So an update of the state alone is exact, and for a step ξ in the tangent
-space the speeds stay Gaussian, u | ξ ~ N(m + K ξ, C).
-"""
+"""Process models: prediction along q̇ = R(q) u, and default process noise."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from collections.abc import Set as AbstractSet
 from contextlib import suppress
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal, TypeAlias
 
 import numpy as np
 
 from kineverse.compilation import compile
 from kineverse.errors import InvalidValueError, KineverseError, UnknownNameError, suggest
-from kineverse.estimation.linear_algebra import (
-    inverse_spd,
-    invert_matrices,
-    multiply_vectors,
-    symmetric,
-    transposed,
-)
+from kineverse.estimation.linear_algebra import inverse_spd
 from kineverse.expressions.expression import Expression, array, as_expression
 from kineverse.expressions.substitution import apply_substitution
 from kineverse.lie import Array
@@ -146,6 +131,10 @@ class ProcessModel:
         group = self._layout.groups[number]
         return number not in self._flows and not any(speeds.get(v, 0.0) for v in group.tangent)
 
+    def is_carried(self, number: int) -> bool:
+        """Return True if rates other than their own speeds move coordinates of a group."""
+        return number in self._flows
+
     def wait(self, timeout: float | None) -> None:
         """Wait until retraction runs in compiled code."""
         for motion in self._steps.values():
@@ -213,191 +202,101 @@ class ProcessModel:
 
 Process: TypeAlias = Literal["position", "velocity", "static"]
 
-PROCESSES: Mapping[str, tuple[float, float]] = {"position": (0.004, 0.01), "velocity": (0.1, 0.3)}
+PROCESSES: Mapping[str, tuple[float, float]] = {
+    "position": (0.004, 0.01),
+    "velocity": (0.1, 0.3),
+    "static": (0.0, 0.0),
+}
 """Linear and angular noise of frames: of positions [m²/s], [rad²/s], or of speeds [m²/s³], [rad²/s³].
 
 They suit a kitchen door that a hand opens within 3.5 s (``kineverse reproduce stream``)."""
 
 INITIAL_SPEED_TIME = 3.0  # the initial variance of a speed is its process noise during this time [s]
+SPEED_DECAY = 2.0 * INITIAL_SPEED_TIME  # time of decay for which this variance is stationary [s]
 
 # Relative positions between limits at which frames are sampled, in addition to the start.
 _SAMPLES = (0.2, 0.5, 0.8)
 _LEAST = 1e-6
+_MOST_OPPOSED = 4.0  # largest ratio of noise for parts that move against each other: at twice the speed
 
 
-def check_process(process: str) -> None:
-    """Check the name of a process model."""
-    known = (*PROCESSES, "static")
-    if process not in known:
-        raise InvalidValueError(f"There is no process {process!r}. {suggest(str(process), known, 'process')}")
+def choose_processes(
+    process: Process | None,
+    process_model: ProcessModel,
+    layout: Layout,
+    stated: Speeds,
+    measured: AbstractSet[int],
+) -> list[Process]:
+    """Return the process of each group.
+
+    By default speeds are estimated where rates carry a group, unless process noise is stated, which is that
+    of positions there, and where speeds are measured.
+    """
+    if process is not None and process not in PROCESSES:
+        hint = suggest(str(process), PROCESSES, "process")
+        raise InvalidValueError(f"There is no process {process!r}. {hint}")
+    if measured and process not in (None, "velocity"):
+        raise InvalidValueError(
+            f"process={process!r} estimates no speeds, but some are measured. Leave it out, or choose "
+            'process="velocity".'
+        )
+    chosen: list[Process] = []
+    for number in range(len(layout.groups)):
+        is_stated = not stated.keys().isdisjoint(process_model.speeds_of(number))
+        is_moving = number in measured or (process_model.is_carried(number) and not is_stated)
+        chosen.append(process or ("velocity" if is_moving else "position"))
+    return chosen
 
 
 def default_process_noise(
-    update_step: UpdateStep, process: Process, start: Array, inputs: Array
+    update_step: UpdateStep, processes: Sequence[Process], start: Array, inputs: Array
 ) -> dict[Symbol, float]:
     """Return the process noise of each speed: a variance per second, or a density of accelerations."""
-    if process == "static":
-        return {}
-    angular = PROCESSES[process][1]
-    largest = dict.fromkeys(update_step.process_model.speeds.values(), 0.0)
-    limits = update_step.limits
+    limits, process_model = update_step.limits, update_step.process_model
     bounded = np.isfinite(limits.upper - limits.lower)
     lower, upper = limits.lower[bounded], limits.upper[bounded]
     states = [start]
     for share in _SAMPLES:
         states.append(start.copy())
         states[-1][bounded] = lower + share * (upper - lower)
+    outputs = []
     for x in states:
         with suppress(KineverseError):  # infeasible
-            for v, square in _frame_motions(update_step, x, inputs, *PROCESSES[process]):
-                largest[v] = max(largest[v], square)
-    return {v: 1.0 / square if square > _LEAST else angular for v, square in largest.items()}
+            outputs.append((x, update_step.residuals.evaluate(x, inputs)))
+    result: dict[Symbol, float] = {}
+    for number, process in enumerate(processes):
+        if process == "static":
+            continue
+        linear, angular = PROCESSES[process]
+        squares = [_frame_motion(update_step, number, x, out, inputs, linear, angular) for x, out in outputs]
+        largest = np.max(squares, axis=0, initial=0.0)
+        noise = np.where(largest > _LEAST, 1.0 / np.maximum(largest, _LEAST), angular)
+        result |= zip(process_model.speeds_of(number), noise.tolist(), strict=True)
+    return result
 
 
-def _frame_motions(
-    update_step: UpdateStep, x: Array, inputs: Array, linear: float, angular: float
-) -> Iterator[tuple[Symbol, float]]:
-    """Yield the square of the motion of each frame by each speed, in units of the noise of frames."""
+def _frame_motion(
+    update_step: UpdateStep, number: int, x: Array, out: Array, inputs: Array, linear: float, angular: float
+) -> Array:
+    """Return the square of the motion of the group's frames by each speed, in units of their noise (k,).
+
+    It is less for speeds that move frames against each other, since each frame moves by itself.
+    """
     layout, process_model = update_step.layout, update_step.process_model
-    out = update_step.residuals.evaluate(x, inputs)
-    for number, group in enumerate(layout.groups):
-        speeds = process_model.speeds_of(number)
-        _, _, gain = process_model.transition(number, x[group.x], np.zeros(len(speeds)), inputs)
-        for i in group.observation_indices:
-            one = layout.observations[i]
-            if one.frame:
-                slope = out[layout.jacobian_slices[i]].reshape(one.size, len(group.t)) @ gain
-                squares = np.square(slope[:3]).sum(axis=0) / linear
-                if one.is_pose:
-                    squares = np.maximum(squares, np.square(slope[3:]).sum(axis=0) / angular)
-                yield from ((v, s) for v, s in zip(speeds, squares.tolist(), strict=True) if math.isfinite(s))
-
-
-_SETTLED = 1e-12
-_MOST_SUBSTEPS = 10
-
-
-@dataclass(frozen=True, eq=False)
-class ConditionalSpeeds:
-    """Gaussian of the speeds of a group given its state: u | ξ ~ N(m + K ξ, C)."""
-
-    anchor: Array  # coordinates (n,) in whose tangent space ξ is
-    mean: Array  # m (k,), K (k, t) and C (k, k)
-    gain: Array
-    covariance: Array
-
-
-class ConstantVelocity:
-    """Prediction of states and speeds."""
-
-    def __init__(self, layout: Layout, process_model: ProcessModel) -> None:
-        self._layout, self._process_model = layout, process_model
-        self.periods: Mapping[Symbol, float] = {}
-        by_size: dict[tuple[int, int], list[int]] = {}
-        for number, group in enumerate(layout.groups):
-            by_size.setdefault((len(group.t), len(process_model.speeds_of(number))), []).append(number)
-        self._batches = list(by_size.values())
-
-    def initialise(self, belief: InformationState, means: Speeds, variances: Speeds) -> None:
-        """Set the speeds of all groups, those without a mean to 0, independent of the state; in place."""
-        for number, group in enumerate(self._layout.groups):
-            speeds = self._process_model.speeds_of(number)
-            mean, gain = np.array([means.get(v, 0.0) for v in speeds]), np.zeros((len(speeds), len(group.t)))
-            covariance = np.diag([variances[v] for v in speeds])
-            belief.speeds[number] = ConditionalSpeeds(belief.x[group.x].copy(), mean, gain, covariance)
-
-    def at_state(self, number: int, belief: InformationState, inputs: Array) -> ConditionalSpeeds:
-        """Return the speeds of a group given a step in the tangent space at its present state."""
-        speeds = belief.speeds[number]
-        assert speeds is not None
-        x = belief.x[self._layout.groups[number].x]
-        if np.array_equal(x, speeds.anchor):
-            return speeds
-        step, transport = self._step_between(number, speeds.anchor, x, inputs)
-        gain = speeds.gain if transport is None else speeds.gain @ np.linalg.inv(transport)
-        return ConditionalSpeeds(x, speeds.mean + speeds.gain @ step, gain, speeds.covariance)
-
-    def covariance(self, number: int, belief: InformationState, inputs: Array, state: Array) -> Array:
-        """Return the covariance of the speeds of a group (k, k), for a covariance of its state (t, t)."""
-        speeds = self.at_state(number, belief, inputs)
-        return symmetric(speeds.covariance + speeds.gain @ state @ speeds.gain.T)
-
-    def predict(
-        self, belief: InformationState, inputs: Array, dt: float, commands: Speeds, noise: Speeds
-    ) -> None:
-        """Predict states and speeds by ``dt`` seconds; in place."""
-        # Too long a step leads to numbers that are not finite, which the caller refuses.
-        with np.errstate(over="ignore", invalid="ignore"):
-            for numbers in self._batches:
-                self._predict(numbers, belief, inputs, np.float64(dt), commands, noise)
-
-    def _predict(
-        self,
-        numbers: Sequence[int],
-        belief: InformationState,
-        inputs: Array,
-        dt: float,
-        commands: Speeds,
-        noise: Speeds,
-    ) -> None:
-        groups = [self._layout.groups[n] for n in numbers]
-        speeds = [self.at_state(n, belief, inputs) for n in numbers]
-        t = np.array([group.t for group in groups])
-        rows, columns = t[:, :, None], t[:, None, :]
-        covariance = invert_matrices(belief.information[rows, columns])
-        mean = multiply_vectors(covariance, belief.vector[t])
-        gain = np.array([one.gain for one in speeds])
-        speed = np.array([one.mean for one in speeds]) + multiply_vectors(gain, mean)
-        cross = gain @ covariance
-        spread = np.array([one.covariance for one in speeds]) + cross @ transposed(gain)
-        orders = [self._process_model.speeds_of(n) for n in numbers]
-        density = np.array([[noise.get(v, 0.0) for v in order] for order in orders])
-        for g, order in enumerate(orders):
-            for k, v in enumerate(order):
-                if v in commands:
-                    speed[g, k], density[g, k] = commands[v], 0.0
-                    cross[g, k] = spread[g, k] = spread[g, :, k] = 0.0
-        ends = [
-            self._process_model.transition(n, belief.x[group.x], by, inputs)
-            for n, group, by in zip(numbers, groups, speed * dt, strict=True)
-        ]
-        slope, by_speed = (np.array([end[i] for end in ends]) for i in (1, 2))
-        # [ξ; u] ← [slope, by_speed dt; 0, 1] [ξ; u], with the noise of an integrated white acceleration.
-        moved = cross @ transposed(slope) + dt * spread @ transposed(by_speed)
-        moved += dt**2 / 2 * density[:, :, None] * transposed(by_speed)
-        state = slope @ covariance @ transposed(slope)
-        coupled = dt * by_speed @ cross @ transposed(slope)
-        state += coupled + transposed(coupled)
-        spread_and_noise = dt**2 * spread + dt**3 / 3 * density[:, :, None] * np.eye(density.shape[1])
-        state += by_speed @ spread_and_noise @ transposed(by_speed)
-        information = invert_matrices(symmetric(state))
-        regression, mean = moved @ information, multiply_vectors(slope, mean)
-        left = spread + dt * density[:, :, None] * np.eye(density.shape[1]) - regression @ transposed(moved)
-        left = symmetric(left)
-        belief.information[rows, columns] = information
-        belief.vector[t] = multiply_vectors(information, mean)
-        speed -= multiply_vectors(regression, mean)
-        for g, (number, group) in enumerate(zip(numbers, groups, strict=True)):
-            after = ends[g][0]
-            belief.x[group.x] = after
-            belief.speeds[number] = ConditionalSpeeds(after, speed[g], regression[g], left[g])
-
-    def _step_between(
-        self, number: int, start: Array, end: Array, inputs: Array
-    ) -> tuple[Array, Array | None]:
-        """Return the tangent step between two states of a group, and its transport."""
-        change = end - start
-        for k, x in enumerate(self._layout.groups[number].coordinates):
-            if x in self.periods:
-                change[k] = math.remainder(change[k], self.periods[x])
-        if self._process_model.flow(number) is None:
-            return change, None
-        target = start + change
-        step = np.linalg.pinv(self._process_model.basis(number, start, inputs)) @ change
-        for _ in range(_MOST_SUBSTEPS):
-            there, transport = self._process_model.retract(number, start, step, inputs)
-            left = np.linalg.pinv(self._process_model.basis(number, there, inputs)) @ (target - there)
-            step = step + left
-            if float(left @ left) < _SETTLED:
-                break
-        return step, transport
+    group, speeds = layout.groups[number], process_model.speeds_of(number)
+    _, _, gain = process_model.transition(number, x[group.x], np.zeros(len(speeds)), inputs)
+    largest, together = np.zeros(len(speeds)), np.zeros((len(speeds), len(speeds)))
+    for i in group.observation_indices:
+        one = layout.observations[i]
+        slope = out[layout.jacobian_slices[i]].reshape(one.size, len(group.t)) @ gain
+        if not one.frame or not np.isfinite(slope).all():
+            continue
+        slope = slope / np.sqrt([linear] * 3 + [angular] * (one.size - 3))[:, None]
+        for part in (slope[:3], slope[3:]):
+            largest = np.maximum(largest, np.square(part).sum(axis=0))
+        together += slope.T @ slope
+    scale = np.sqrt(np.diag(together))
+    scale[scale == 0.0] = 1.0
+    correlation = together / np.outer(scale, scale) + np.eye(len(scale)) * 1e-12
+    opposed = np.diag(np.linalg.inv(correlation)) * np.diag(correlation)
+    return np.asarray(largest / np.clip(opposed, 1.0, _MOST_OPPOSED))

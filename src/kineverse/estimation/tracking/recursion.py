@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from types import MappingProxyType
@@ -15,12 +15,13 @@ from kineverse.lie import Array
 from kineverse.state import State, StateLike
 
 from .bounds import SpeedLocks
-from .estimate import TrackerState, TrackLoss, find_measured, find_refuted
+from .estimate import TrackerState, TrackLoss, find_refuted
 from .gaussian_sum_filter import StepResult, UpdateStep
 from .information_state import InformationState
 from .initialization import InitialBelief
 from .process_model import Speeds
 from .residuals import Measurements
+from .speed_update import SpeedUpdate, SpeedValue
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,6 +79,7 @@ def _apply_late(
 
 
 NO_NOISE: Speeds = MappingProxyType({})  # process noise of no speed
+NO_SPEEDS: Mapping[str, SpeedValue] = {}  # no measured speeds; a proxy could not be pickled
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,6 +87,7 @@ class Recursion:
     """Prediction and update of states, which it never changes in place."""
 
     update_step: UpdateStep
+    speed_update: SpeedUpdate
     first: InitialBelief
     noise: Speeds  # process noise by speed
     locks: SpeedLocks | None  # None if locks are ignored
@@ -96,7 +99,8 @@ class Recursion:
         mixture = self.first.spread(self.update_step, np.nan_to_num(inputs))
         count = len(self.update_step.layout.groups)
         result = StepResult(mixture, np.zeros(count), np.zeros(count), (), 0)
-        loss = TrackLoss(np.zeros(count, dtype=np.int64), np.zeros(count, dtype=bool))
+        none = np.zeros(len(self.update_step.layout.observations), dtype=np.int64)
+        loss = TrackLoss(none, np.zeros(count, dtype=np.int64), np.zeros(count, dtype=bool))
         return TrackerState(mixture, result, loss, inputs, stamp)
 
     def predict(
@@ -144,6 +148,7 @@ class Recursion:
         speeds: Speeds,
         inputs: StateLike | None,
         noise_now: Speeds = NO_NOISE,
+        measured_speeds: Mapping[str, SpeedValue] = NO_SPEEDS,
     ) -> TrackerState:
         """Return the state after a reading at a time, or at the present one."""
         step, values = self.update_step, self.read_inputs(state.inputs, inputs)
@@ -155,24 +160,38 @@ class Recursion:
             state, latest = self.advance(state, stamp, speeds, noise_now=noise_now), reading
             if state.reading is not None:
                 latest = step.reader.combine(state.reading, reading, stamp)
-        result = step.update(state.mixture, reading, values)
+        mixture, nis, dof, wrong = self.speed_update.update(state.mixture, reading, measured_speeds, values)
+        result = step.update(mixture, reading, values)
+        result.nis, result.dof = result.nis + nis, result.dof + dof
         has_outliers = step.outliers is not None
         refuted = find_refuted(step.layout, reading, result, has_outliers)
         loss, mixture = state.loss, result.mixture
-        if not loss.is_clear or refuted.any():
-            loss = loss.after(find_measured(step.layout, reading), refuted, self.lost_after)
+        loss = loss.after(step.layout, reading, result.outliers, refuted, self.lost_after)
+        if result.outliers or refuted.any():
             due = loss.is_lost & (loss.refuted % self.lost_after == 0) & refuted
+            if has_outliers:
+                due = loss.find_due(step.layout, result.outliers, self.lost_after)
             if self.restarts and due.any():
-                groups, initial = np.flatnonzero(due).tolist(), self.first.spread(step, values)
+                groups = np.flatnonzero(due).tolist()
+                initial = self.first.moved(step, state.mixture.best.x, self.noise).spread(step, values)
                 restarted = step.restart(state.mixture, initial, groups, reading, values)
                 if has_outliers:
-                    explained = due & step.find_accepted(restarted.mixture, reading, values)
+                    mask = np.isin(np.arange(len(reading.mask)), result.outliers)
+                    rejected = reading._replace(mask=mask)
+                    explained = due & step.find_accepted(restarted.mixture, rejected, values)
+                    mixture = mixture.join(restarted.mixture, explained)
+                    is_found = due & step.find_accepted(mixture, rejected, values)[0]
                 else:
-                    explained = due & ~find_refuted(step.layout, reading, restarted, has_outliers)
-                mixture = mixture.replace_groups(restarted.mixture, np.flatnonzero(explained).tolist())
+                    is_found = due & ~find_refuted(step.layout, reading, restarted, has_outliers)
+                    mixture = mixture.replace_groups(restarted.mixture, np.flatnonzero(is_found).tolist())
                 # They stay lost until measurements agree with them.
-                loss = replace(loss, refuted=np.where(explained, 0, loss.refuted))
-        return TrackerState(mixture, result, loss, values, state.stamp, latest)
+                loss = replace(loss, refuted=np.where(is_found, 0, loss.refuted))
+        outliers = (*(step.layout.observations[i].name for i in result.outliers), *wrong)
+        predicted = state.mixture.best
+        residuals = partial(
+            self.speed_update.residuals, predicted, reading, measured_speeds, values, outliers
+        )
+        return TrackerState(mixture, result, loss, values, state.stamp, latest, outliers, residuals)
 
     def read_inputs(self, last: Array, inputs: StateLike | None) -> Array:
         """Return the values of the inputs, with the last ones for those that are absent."""

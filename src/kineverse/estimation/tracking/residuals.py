@@ -66,14 +66,12 @@ class MeasurementReader:
                 hint = suggest(str(name), self._index, "observation")
                 raise UnknownNameError(f"'{name}' is not observed. {hint}")
             one = self._layout.observations[i]
-            if _is_pair(value, one):
-                value, covariance = value
-                checked = require_covariance(covariance, one.size, one.label)
+            values[self._layout.measurement_slices[i]], covariance = read_value(value, one)
+            if covariance is not one.covariance:
                 if whitenings is self._whitening:
                     whitenings, scales = whitenings.copy(), scales.copy()
-                whitenings[self._layout.whitening_slices[i]] = whitening(checked).reshape(-1)
-                scales[i] = log_scale(checked)
-            values[self._layout.measurement_slices[i]] = _checked_value(value, one)
+                whitenings[self._layout.whitening_slices[i]] = whitening(covariance).reshape(-1)
+                scales[i] = log_scale(covariance)
             observed[i] = True
         return Measurements(values, observed, whitenings, scales)
 
@@ -137,6 +135,15 @@ class MeasurementReader:
             if one.is_pose and reading.mask[i]:
                 pose = reading.values[self._layout.measurement_slices[i]].reshape(1, 4, 4)
                 check_rigid(pose, f"measurement '{one.label}'")
+
+
+def read_value(value: Any, one: MeasurementModel) -> tuple[Array, Array]:
+    """Return the checked value of a measurement, flattened, and its covariance, the default one if absent."""
+    covariance = one.covariance
+    if _is_pair(value, one):
+        value, stated = value
+        covariance = require_covariance(stated, one.size, one.label)
+    return _checked_value(value, one), covariance
 
 
 def _is_pair(value: Any, one: MeasurementModel) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import math
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
@@ -21,15 +22,23 @@ from kineverse.state import State, StateLike
 from kineverse.symbols import Symbol
 
 from .bounds import SpeedLocks, arrange_state
-from .estimate import Estimate, RecentPoses, TrackerState, TrackLoss, collect_recent_poses
+from .estimate import Estimate, RecentPoses, RecentReading, TrackerState, TrackLoss, collect_recent_poses
 from .gaussian_sum_filter import UpdateStep
 from .information_state import InformationState
 from .initialization import InitialValues, make_initial_belief
 from .measurements import ObservedLike, build_measurement_models, list_observed, require_mapping, require_time
 from .native import native_library
-from .process_model import INITIAL_SPEED_TIME, Process, check_process, default_process_noise
-from .recursion import FixedLag, Recursion, Step
+from .process_model import (
+    INITIAL_SPEED_TIME,
+    SPEED_DECAY,
+    Process,
+    choose_processes,
+    default_process_noise,
+)
+from .recursion import NO_SPEEDS, FixedLag, Recursion, Step
 from .residuals import Measurements
+from .speed_process import SpeedProcess
+from .speed_update import SpeedUpdate, SpeedValue, build_speed_models
 
 if TYPE_CHECKING:
     from kineverse.model.model_view import ModelView
@@ -57,13 +66,17 @@ class Tracker:
         [m/s], [rad/s] by speed.
     process
         Process model: ``"position"`` for positions that move at random, ``"velocity"`` for speeds that change
-        at random and are estimated, ``"static"`` for a state that is constant unless it is commanded.
+        at random and are estimated, ``"static"`` for a state that is constant unless it is commanded. By
+        default speeds are estimated, and decay within seconds, where wheels or other rates move a part and
+        where speeds are measured; all other positions move at random.
     process_noise
         Process noise by speed or coordinate: the variance per second, or for ``process="velocity"`` the
         spectral density of the acceleration [m²/s³], [rad²/s³]. By default that of furniture that a hand
         moves, see :mod:`.process_model`, and none for ``process="static"``. 0 for a part that never moves.
+        Without ``process=`` it is that of positions.
     outliers
-        Outlier model: :class:`Outliers`, or True for the default one. None without outliers.
+        Outlier model: :class:`Outliers`, or True for the default one. None if all errors have the stated
+        noise.
     locks
         True if coordinates held by a lock of the model ignore commands and process noise.
     inputs
@@ -88,7 +101,7 @@ class Tracker:
         *,
         start: StateLike | None = None,
         uncertainty: StateLike | None = None,
-        process: Process = "position",
+        process: Process | None = None,
         process_noise: StateLike | None = None,
         outliers: Outliers | bool | None = None,
         locks: bool = False,
@@ -112,31 +125,43 @@ class Tracker:
             "lag": lag,
             "keep": keep,
         }
-        check_process(process)
         lost_after, keep = as_count("lost_after", lost_after, 1), as_count("keep", keep, 1)
         lag = as_tolerance(lag, "lag= [s]")
         keys = (inputs,) if isinstance(inputs, str | Symbol) else inputs
         if not isinstance(keys, Iterable):
             raise InvalidValueError(f"inputs= has names of coordinates, not {inputs!r:.80}.")
         symbols = frozenset(k if isinstance(k, Symbol) else model.symbol(k) for k in keys)
-        layout, limits = arrange_state(model, build_measurement_models(model, self._observed), symbols)
+        models = build_measurement_models(model, self._observed)
+        of_speeds = [one for one in models if any(s.order for s in one.value.symbols)]
+        of_state = tuple(one for one in models if one not in of_speeds)
+        layout, limits = arrange_state(model, of_state, symbols)
         self.model, self._layout = model, layout
         outliers = as_outliers(outliers, has_gate=True)
-        self._update_step = UpdateStep(layout, limits, outliers, process == "velocity")
-        noise = self._read_noise(process_noise)
+        self._update_step = UpdateStep(layout, limits, outliers)
+        stated, process_model = self._read_noise(process_noise), self._update_step.process_model
+        speed_models = build_speed_models(self._update_step, of_speeds)
+        measured = {one.number for one in speed_models.values()}
+        processes = choose_processes(process, process_model, layout, stated, measured)
+        if groups := [n for n, each in enumerate(processes) if each == "velocity"]:
+            decay = SPEED_DECAY if process is None else math.inf
+            residuals = self._update_step.residuals
+            self._update_step.velocity = SpeedProcess(layout, process_model, groups, residuals, decay)
         values = np.array([np.nan if s.value is None else s.value for s in layout.inputs])
         known = np.nan_to_num(values)
         initial = InitialValues.read(self._update_step, start, uncertainty)
         first = make_initial_belief(model, self._update_step, initial, known)
-        noise = {**default_process_noise(self._update_step, process, first.x, known), **noise}
+        noise = {**default_process_noise(self._update_step, processes, first.x, known), **stated}
         variances = {v: INITIAL_SPEED_TIME * q for v, q in noise.items()}
         first = replace(first, speed_variances={**variances, **first.speed_variances})
         held = SpeedLocks(model, layout, self._update_step.process_model) if locks else None
-        self._recursion = Recursion(self._update_step, first, noise, held, lost_after, restart)
+        self._speed_update = SpeedUpdate(self._update_step, speed_models)
+        self._recursion = Recursion(
+            self._update_step, self._speed_update, first, noise, held, lost_after, restart
+        )
         self._now = self._recursion.start(values, getattr(start, "stamp", None))
         self._buffer = FixedLag(lag)
         self._lock = CallLock()
-        self._recent: deque[tuple[float | None, Measurements, Array]] = deque(maxlen=keep)
+        self._recent: deque[RecentReading] = deque(maxlen=keep)
 
     @property
     def symbols(self) -> tuple[Symbol, ...]:
@@ -167,7 +192,7 @@ class Tracker:
     @property
     def observed(self) -> tuple[str, ...]:
         """Names of the observations, in order."""
-        return tuple(one.name for one in self._layout.observations)
+        return (*(one.name for one in self._layout.observations), *self._speed_update.models)
 
     @property
     def estimate(self) -> Estimate:
@@ -229,11 +254,11 @@ class Tracker:
     def _repeat(self, other: Tracker) -> None:
         inputs = {str(s): k for k, s in enumerate(other._layout.inputs)}
         recent = list(other._recent)
-        if all(stamp is not None for stamp, _, _ in recent):
+        if all(stamp is not None for stamp, *_ in recent):
             recent.sort(key=lambda one: one[0] or 0.0)
-        for stamp, reading, values in recent:
+        for stamp, reading, values, speeds in recent:
             known = {s: values[inputs[str(s)]] for s in self._layout.inputs if str(s) in inputs}
-            self._update(reading, stamp, None, State(known))
+            self._update(reading, stamp, None, State(known), None, speeds)
 
     def _turns_from(self, other: Tracker) -> Array:
         """Return the whole turns of periodic coordinates to those of another tracker (n,) [rad]."""
@@ -294,7 +319,11 @@ class Tracker:
         initial = first.spread(self._update_step, np.nan_to_num(now.inputs))
         mixture = now.mixture.replace_groups(initial, groups)
         chosen = np.isin(np.arange(len(self._layout.groups)), groups)
-        loss = TrackLoss(np.where(chosen, 0, now.loss.refuted), now.loss.is_lost & ~chosen)
+        loss = TrackLoss(
+            np.where(chosen[list(self._layout.group_of)], 0, now.loss.rejected),
+            np.where(chosen, 0, now.loss.refuted),
+            now.loss.is_lost & ~chosen,
+        )
         self._now = replace(now, mixture=mixture, loss=loss, stamp=stamp, reading=None)
         self._buffer.steps = ()
         if stamp is not None and now.stamp is not None and stamp < now.stamp:
@@ -387,7 +416,10 @@ class Tracker:
             For an invalid measurement, naming it, or if time goes backwards by more than the lag. The belief
             does not change then.
         """
-        return self._update(self._update_step.reader.read(measurements), at, commands, inputs, process_noise)
+        require_mapping(measurements, "A set of measurements")
+        of_state, of_speeds = self._speed_update.read(measurements)
+        reading = self._update_step.reader.read(of_state)
+        return self._update(reading, at, commands, inputs, process_noise, of_speeds)
 
     @one_at_a_time
     def update_poses(
@@ -440,6 +472,7 @@ class Tracker:
         commands: StateLike | None,
         inputs: StateLike | None,
         process_noise: StateLike | None = None,
+        measured_speeds: Mapping[str, SpeedValue] = NO_SPEEDS,
     ) -> Estimate:
         # The caller may use the arrays again, while late measurements repeat the update.
         reading = reading._replace(values=reading.values.copy(), mask=reading.mask.copy())
@@ -453,7 +486,7 @@ class Tracker:
         stamp = None if at is None else require_time(at)
         speeds, before = self._read_commands(commands), self._now
         update, fixed = partial(self._recursion.update, reading=reading, stamp=stamp), copy.copy(inputs)
-        apply = partial(update, speeds=speeds, inputs=fixed, noise_now=noise)
+        apply = partial(update, speeds=speeds, inputs=fixed, noise_now=noise, measured_speeds=measured_speeds)
         if stamp is not None and before.stamp is not None and stamp < before.stamp:
             if not self._buffer.lag:
                 raise InvalidValueError(
@@ -466,7 +499,7 @@ class Tracker:
             if self._now.stamp is not None:
                 advance = partial(self._recursion.advance, speeds=speeds, noise_now=noise)
                 self._remember(before, self._now.stamp, apply, advance)
-        self._recent.append((stamp, reading, self._now.inputs))
+        self._recent.append((stamp, reading, self._now.inputs, measured_speeds))
         return self.estimate
 
     def _remember(

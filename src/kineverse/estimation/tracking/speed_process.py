@@ -1,0 +1,256 @@
+"""Estimated speeds: prediction with white accelerations, and updates of states and speeds together.
+
+Speeds change by white accelerations of the spectral density q and decay with the time τ (Singer, Estimating
+optimal tracking filter performance for manned maneuvering targets, 1970). Without decay they are the constant
+velocities of Bar-Shalom, Li and Kirubarajan, Estimation with Applications to Tracking and Navigation, 2001,
+6.2.2:
+
+    ẋ = R(x) u,    u̇ = -u/τ + w,    Cov ∫ w dt = q dt
+
+For a step ξ in the tangent space the speeds stay Gaussian, u | ξ ~ N(m + K ξ, C). So an update by
+measurements of the state alone is exact.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TypeAlias
+
+import numpy as np
+
+from kineverse.estimation.linear_algebra import (
+    inverse_spd,
+    invert_matrices,
+    multiply_vectors,
+    symmetric,
+    transposed,
+)
+from kineverse.lie import Array
+from kineverse.symbols import Symbol
+
+from .information_state import InformationState
+from .process_model import ProcessModel, Speeds
+from .residuals import Residuals
+from .state_space import Layout
+
+_SETTLED = 1e-12
+_MOST_SUBSTEPS = 10
+_KNOWN = 0.5  # largest free motion that a Gaussian describes [m], [rad]
+
+Rows: TypeAlias = Callable[[Array, Array], tuple[Array, Array, Array]]
+"""Function of the whole state and a group's speeds (k,): whitened errors (d,), and the Jacobians of predicted
+measurements by the state (d, t) and by the speeds (d, k)."""
+
+
+@dataclass(frozen=True, eq=False)
+class ConditionalSpeeds:
+    """Gaussian of the speeds of a group given its state: u | ξ ~ N(m + K ξ, C)."""
+
+    anchor: Array  # coordinates (n,) in whose tangent space ξ is
+    mean: Array  # m (k,), K (k, t) and C (k, k)
+    gain: Array
+    covariance: Array
+    free: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Unmeasured motion in a redundant group: variances of place and speed, their covariance between."""
+
+
+class SpeedProcess:
+    """Prediction of states and speeds of some groups.
+
+    Measurements leave directions of a redundant group free, such as an arm of seven joints seen at its tip.
+    These directions turn with the state, so that information about others passes for information about them.
+    Once free motion may be long, nothing is therefore stated about the coordinates of the group.
+    """
+
+    def __init__(
+        self,
+        layout: Layout,
+        process_model: ProcessModel,
+        groups: Iterable[int],
+        residuals: Residuals,
+        decay: float = math.inf,
+    ) -> None:
+        self._layout, self._process_model = layout, process_model
+        self._residuals, self._decay = residuals, decay
+        self.groups = tuple(groups)
+        self.periods: Mapping[Symbol, float] = {}
+        self.redundant: frozenset[int] = frozenset()
+        by_size: dict[tuple[int, int], list[int]] = {}
+        for number in self.groups:
+            size = len(layout.groups[number].t), len(process_model.speeds_of(number))
+            by_size.setdefault(size, []).append(number)
+        self._batches = list(by_size.values())
+
+    def initialise(self, belief: InformationState, means: Speeds, variances: Speeds, inputs: Array) -> None:
+        """Set the speeds of all groups, those without a mean to 0, independent of the state; in place."""
+        self.redundant = frozenset(self._find_redundant(belief, inputs))
+        for number in self.groups:
+            group, speeds = self._layout.groups[number], self._process_model.speeds_of(number)
+            mean, gain = np.array([means.get(v, 0.0) for v in speeds]), np.zeros((len(speeds), len(group.t)))
+            covariance, free = np.diag([variances[v] for v in speeds]), (0.0, 0.0, 0.0)
+            if number in self.redundant:
+                state = inverse_spd(belief.information[group.block])
+                free = float(np.diag(state).max()), 0.0, float(np.diag(covariance).max())
+            belief.speeds[number] = ConditionalSpeeds(belief.x[group.x].copy(), mean, gain, covariance, free)
+
+    def _find_redundant(self, belief: InformationState, inputs: Array) -> Iterator[int]:
+        out = self._residuals.evaluate(belief.x, inputs)
+        for number in self.groups:
+            group = self._layout.groups[number]
+            rows = np.concatenate([out[self._layout.jacobian_slices[i]] for i in group.observation_indices])
+            rows = rows.reshape(-1, len(group.t))
+            # Rates and linear measurements inform about free directions over time.
+            if not (self._process_model.is_carried(number) or self._layout.is_affine(number)):
+                if np.isfinite(rows).all() and np.linalg.matrix_rank(rows) < len(group.t):
+                    yield number
+
+    def at_state(self, number: int, belief: InformationState, inputs: Array) -> ConditionalSpeeds:
+        """Return the speeds of a group given a step in the tangent space at its present state."""
+        speeds = belief.speeds[number]
+        assert speeds is not None
+        x = belief.x[self._layout.groups[number].x]
+        if np.array_equal(x, speeds.anchor):
+            return speeds
+        step, transport = self._step_between(number, speeds.anchor, x, inputs)
+        gain = speeds.gain if transport is None else speeds.gain @ np.linalg.inv(transport)
+        return replace(speeds, anchor=x.copy(), mean=speeds.mean + speeds.gain @ step, gain=gain)
+
+    def innovate(
+        self, number: int, belief: InformationState, inputs: Array, rows: Rows
+    ) -> tuple[Array, Array, Array, Array]:
+        """Return innovations, their slopes by state and speeds, and mean and covariance of both."""
+        group, speeds = self._layout.groups[number], self.at_state(number, belief, inputs)
+        errors, by_state, by_speed = rows(belief.x, speeds.mean)
+        state = inverse_spd(belief.information[group.block])
+        cross, step = speeds.gain @ state, state @ belief.vector[group.t]
+        joint = np.block([[state, cross.T], [cross, speeds.covariance + cross @ speeds.gain.T]])
+        slope, mean = np.hstack([by_state, by_speed]), np.concatenate([step, speeds.gain @ step])
+        return errors - slope @ mean, slope, mean, joint
+
+    def measure(
+        self, number: int, belief: InformationState, inputs: Array, rows: Rows
+    ) -> tuple[Array, Array]:
+        """Update a group by measured speeds, in place; return innovations and their covariance."""
+        group, speeds = self._layout.groups[number], self.at_state(number, belief, inputs)
+        errors, slope, mean, joint = self.innovate(number, belief, inputs, rows)
+        t, spread = len(group.t), np.eye(len(errors)) + slope @ joint @ slope.T
+        weights = np.linalg.solve(spread, slope @ joint)
+        mean, joint = mean + weights.T @ errors, symmetric(joint - weights.T @ spread @ weights)
+        information = inverse_spd(joint[:t, :t])
+        gain = joint[t:, :t] @ information
+        belief.information[group.block], belief.vector[group.t] = information, information @ mean[:t]
+        belief.records[number] = None
+        covariance = symmetric(joint[t:, t:] - gain @ joint[:t, t:])
+        speed = speeds.mean + mean[t:] - gain @ mean[:t]
+        belief.speeds[number] = replace(speeds, mean=speed, gain=gain, covariance=covariance)
+        return errors, spread
+
+    def free_variance(self, number: int, belief: InformationState) -> float:
+        """Return the variance of each coordinate of a group of which nothing can be stated; else 0."""
+        speeds = belief.speeds[number]
+        variance = 0.0 if speeds is None else speeds.free[0]
+        return variance if variance > _KNOWN**2 and speeds is not None and speeds.gain.any() else 0.0
+
+    def covariance(self, number: int, belief: InformationState, inputs: Array, state: Array) -> Array:
+        """Return the covariance of the speeds of a group (k, k), for a covariance of its state (t, t)."""
+        speeds = self.at_state(number, belief, inputs)
+        return symmetric(speeds.covariance + speeds.gain @ state @ speeds.gain.T)
+
+    def predict(
+        self, belief: InformationState, inputs: Array, dt: float, commands: Speeds, noise: Speeds
+    ) -> None:
+        """Predict states and speeds by ``dt`` seconds; in place."""
+        # Too long a step leads to numbers that are not finite, which the caller refuses.
+        with np.errstate(over="ignore", invalid="ignore"):
+            for numbers in self._batches:
+                self._predict(numbers, belief, inputs, np.float64(dt), commands, noise)
+
+    def _predict(
+        self,
+        numbers: Sequence[int],
+        belief: InformationState,
+        inputs: Array,
+        dt: float,
+        commands: Speeds,
+        noise: Speeds,
+    ) -> None:
+        groups = [self._layout.groups[n] for n in numbers]
+        speeds = [self.at_state(n, belief, inputs) for n in numbers]
+        t = np.array([group.t for group in groups])
+        rows, columns = t[:, :, None], t[:, None, :]
+        covariance = invert_matrices(belief.information[rows, columns])
+        mean = multiply_vectors(covariance, belief.vector[t])
+        gain = np.array([one.gain for one in speeds])
+        speed = np.array([one.mean for one in speeds]) + multiply_vectors(gain, mean)
+        cross = gain @ covariance
+        spread = np.array([one.covariance for one in speeds]) + cross @ transposed(gain)
+        orders = [self._process_model.speeds_of(n) for n in numbers]
+        density = np.array([[noise.get(v, 0.0) for v in order] for order in orders])
+        reach, share, integrals = self._integrate(dt)
+        reaches, shares = np.full(speed.shape, reach), np.full(speed.shape, share)
+        for g, order in enumerate(orders):
+            for k, v in enumerate(order):
+                if v in commands:
+                    speed[g, k], density[g, k] = commands[v], 0.0
+                    reaches[g, k], shares[g, k] = dt, 1.0
+                    cross[g, k] = spread[g, k] = spread[g, :, k] = 0.0
+        ends = [
+            self._process_model.transition(n, belief.x[group.x], by, inputs)
+            for n, group, by in zip(numbers, groups, speed * reaches, strict=True)
+        ]
+        slope, by_speed = (np.array([end[i] for end in ends]) for i in (1, 2))
+        # [ξ; u] ← [slope, moved; 0, shares] [ξ; u], with the noise of an integrated white acceleration.
+        moved = by_speed * reaches[:, None, :]
+        added = [integral * density[:, :, None] * np.eye(density.shape[1]) for integral in integrals]
+        coupled = moved @ cross @ transposed(slope)
+        state = slope @ covariance @ transposed(slope) + coupled + transposed(coupled)
+        state += moved @ spread @ transposed(moved) + by_speed @ added[0] @ transposed(by_speed)
+        shared = shares[:, :, None] * (cross @ transposed(slope) + spread @ transposed(moved))
+        shared += added[1] @ transposed(by_speed)
+        information = invert_matrices(symmetric(state))
+        regression, mean = shared @ information, multiply_vectors(slope, mean)
+        left = shares[:, :, None] * spread * shares[:, None, :] + added[2]
+        left = symmetric(left - regression @ transposed(shared))
+        belief.information[rows, columns] = information
+        belief.vector[t] = multiply_vectors(information, mean)
+        speed = shares * speed - multiply_vectors(regression, mean)
+        for g, (number, group) in enumerate(zip(numbers, groups, strict=True)):
+            after = ends[g][0]
+            belief.x[group.x] = after
+            a, b, c = speeds[g].free
+            if not all(v in commands for v in orders[g]):
+                q = float(density[g].max()) if number in self.redundant else 0.0
+                a, b = a + 2 * reach * b + reach**2 * c + integrals[0] * q, share * (b + reach * c)
+                b, c = b + integrals[1] * q, share**2 * c + integrals[2] * q
+            belief.speeds[number] = ConditionalSpeeds(after, speed[g], regression[g], left[g], (a, b, c))
+
+    def _integrate(self, dt: float) -> tuple[float, float, tuple[float, float, float]]:
+        """Return the way of a unit of speed, what is left of it, and the noise of (x, x), (x, u), (u, u)."""
+        tau = self._decay
+        if math.isinf(tau):
+            return dt, 1.0, (dt**3 / 3, dt**2 / 2, dt)
+        share, way = math.exp(-dt / tau), -tau * math.expm1(-dt / tau)
+        speeds = way * (1 + share) / 2
+        return way, share, (tau**2 * max(dt - 2 * way + speeds, 0.0), way**2 / 2, speeds)
+
+    def _step_between(
+        self, number: int, start: Array, end: Array, inputs: Array
+    ) -> tuple[Array, Array | None]:
+        """Return the tangent step between two states of a group, and its transport."""
+        change = end - start
+        for k, x in enumerate(self._layout.groups[number].coordinates):
+            if x in self.periods:
+                change[k] = math.remainder(change[k], self.periods[x])
+        if self._process_model.flow(number) is None:
+            return change, None
+        target = start + change
+        step = np.linalg.pinv(self._process_model.basis(number, start, inputs)) @ change
+        for _ in range(_MOST_SUBSTEPS):
+            there, transport = self._process_model.retract(number, start, step, inputs)
+            left = np.linalg.pinv(self._process_model.basis(number, there, inputs)) @ (target - there)
+            step = step + left
+            if float(left @ left) < _SETTLED:
+                break
+        return step, transport
