@@ -58,31 +58,36 @@ static void inform(const Problem *p, const double *x, const double *errors, doub
                                (i < size && j < size ? normal[MOST * i + j] : 0.0);
 }
 
-/* The logarithm of the volume of mean poses per unit of the parameters and joint values that move them. A lever
-   of length zero has no volume; a singular value is at least ATOM [m]. */
+/* The logarithm of the volume of mean poses per unit of the parameters and joint values that move them, by
+   the lengths of their columns across those before. A lever of length zero has none, but ATOM [m]. */
 static double log_volume(const Problem *p, const double *x, const double *mean) {
-  int rows = (int)p->rows, movers = (int)p->movers, n = movers + (int)p->joints;
-  double square[36], column[36];
+  int rows = (int)p->rows, movers = (int)p->movers;
+  double column[6 * (MOST + ALL)], log_sum = 0.0;
   Observation o;
   if (movers < 0) return 0.0;
   memcpy(o.values, mean, p->joints * sizeof(double));
   place(p, x, &o, rows);
-  for (int i = 0; i < n; i++)
+  for (int i = 0; i < movers + (int)p->joints; i++) {
+    double *own = column + 6 * i, square = 0.0;
     for (int r = 0; r < rows; r++)
-      column[6 * i + r] =
-          i < movers ? o.by_parameters[MOST * r + p->mover[i]] : o.by_joints[6 * (i - movers) + r];
-  for (int i = 0; i < n; i++)
-    for (int j = 0; j < n; j++) {
-      square[n * i + j] = i == j ? ATOM * ATOM : 0.0;
-      for (int r = 0; r < rows; r++) square[n * i + j] += column[6 * i + r] * column[6 * j + r];
+      own[r] = i < movers ? o.by_parameters[MOST * r + p->mover[i]] : o.by_joints[6 * (i - movers) + r];
+    for (int j = 0; j < i; j++) {
+      double along = 0.0;
+      for (int r = 0; r < rows; r++) along += own[r] * column[6 * j + r];
+      for (int r = 0; r < rows; r++) own[r] -= along * column[6 * j + r];
     }
-  return log(factorise(square, n));
+    for (int r = 0; r < rows; r++) square += own[r] * own[r];
+    double length = fmax(sqrt(square), ATOM);
+    for (int r = 0; r < rows; r++) own[r] /= length;
+    log_sum += log(length);
+  }
+  return log_sum;
 }
 
 /* As integrate_joint_values in marginal_likelihood.py, for several sizes of the noise. The covariance of the
-   errors is the sum of two parts, times the square of a factor each; without parts it is as it is. The result is
-   of the last size: log likelihood, widths, means, information, joint values alone and within their ranges, and
-   the covariances of both. */
+   errors is the sum of two parts, times the square of a factor each; without parts it is as it is. The result
+   is of the last size: log likelihood, widths, means, information, joint values alone and within their ranges,
+   and the covariances of both. */
 EXPORTED void rate(const Problem *p, int64_t sizes, const double *factors, const double *parts, double weight,
                    double *memory, const double *x, const double *joint_values, const double *residuals,
                    const double *errors, const double *by_joints, double *logs, double *result) {
@@ -102,8 +107,9 @@ EXPORTED void rate(const Problem *p, int64_t sizes, const double *factors, const
     if (joints) widths(p, weight, &apart, memory);
     inform(p, x, S, weight, &apart, values, covariances, information);
     memcpy(copied, information, n * n * sizeof(double));
+    double root = factorise(copied, n);
     logs[i] = weight * apart.log_likelihood + apart.log_density + log_volume(p, x, apart.mean) +
-              0.5 * n * log(TAU) - log(factorise(copied, n));
+              0.5 * n * log(TAU) - (root > 0.0 ? log(root) : INFINITY);
     *log_likelihood = apart.log_likelihood;
     memcpy(deviations, apart.deviations, joints * sizeof(double));
     memcpy(mean, apart.mean, joints * sizeof(double));

@@ -67,8 +67,8 @@ static double density(int64_t count, const double *values, const double *varianc
 
 /* The best width of several columns of values, and the logarithm of the mean over all of them relative to the
    best. */
-static double widest(const Problem *p, double weight, int64_t columns, const double *values, const double *variances,
-                     double *logs, double *deviation) {
+static double widest(const Problem *p, double weight, int64_t columns, const double *values,
+                     const double *variances, double *logs, double *deviation) {
   int64_t top = 0, count = p->count;
   double sum = 0.0, best;
   for (int64_t g = 0; g < p->widths; g++) {

@@ -11,8 +11,8 @@
 typedef struct { const double *covariance, *inverse; int64_t stride, round; } Noise;
 
 typedef struct {
-  /* Generated functions of the motion, see motion_functions.py, and of observations, see observation_functions.
-     Each has one input and one output; their numbers of states, steps, joint values and residuals. */
+  /* Generated functions of the motion, see motion_functions.py, and of observations, see native.py. Each has
+     one input and one output. Their numbers of states, steps, joint values and residuals. */
   Function linearise, retract, slope, prior, errors, turn_parent;
   int64_t states, steps, all_joints, priors;
   /* The family: the steps that are parameters, rows of the prior, parameters that move the mean pose, joint
@@ -113,8 +113,8 @@ INLINE double weigh(const Problem *p, Observation *o, const int rows) {
 }
 
 /* The square of an error in the axes of R, by the k-th covariance, which is left in these axes. */
-INLINE double square_in(const Noise *noise, int64_t k, const double *pose, const double *error, const int rows,
-                        double *covariance) {
+INLINE double square_in(const Noise *noise, int64_t k, const double *pose, const double *error,
+                        const int rows, double *covariance) {
   const double *given = noise->covariance + noise->stride * k, *inverse = noise->inverse + noise->stride * k;
   if (noise->round) {
     memcpy(covariance, given, rows * rows * sizeof(double));
@@ -156,7 +156,7 @@ INLINE double look(const Problem *p, const double *x, int64_t k, Observation *o,
   return p->marginal ? cost + spread + 2.0 * log(root) : cost;
 }
 
-/* Residuals of the prior of the parameters and their derivatives, added to a normal equation. Returns the cost. */
+/* Add the prior of the parameters to a normal equation; returns its cost. */
 static double believe(const Problem *p, const double *x, double *normal, double *right) {
   double output[PRIORS * (1 + STEPS)], cost = 0.0;
   if (!p->beliefs) return 0.0;

@@ -248,8 +248,8 @@ class GeneratedMotion(ABC):
             linear = self.linearise(mean[None, :])
             matrix = np.concatenate([linear.by_parameters[0][:, form.movers], linear.by_joints[0]], axis=1)
             # A lever of length zero has no volume. The bound has the size of an atom [m].
-            square = matrix.T @ matrix + 1e-20 * np.eye(matrix.shape[1])
-            log += 0.5 * float(np.linalg.slogdet(square)[1])
+            lengths = np.abs(np.diagonal(np.linalg.qr(matrix)[1]))
+            log += float(np.sum(np.log(np.maximum(lengths, 1e-10))))
         return log, form.precision
 
     def prior(self) -> ParameterPrior:
