@@ -121,7 +121,7 @@ TRUTHS: Mapping[str, Draw] = {
 RIGHT: Mapping[str, tuple[str, ...]] = {truth: (truth,) for truth in TRUTHS} | {"walk": ("free", "curve")}
 
 
-def draw_case(truth: str, seed: int, number: int) -> JointCase:
+def draw_family_case(truth: str, seed: int, number: int) -> JointCase:
     rng = np.random.default_rng([seed, list(TRUTHS).index(truth), number])
     count = round(log_uniform(rng, *COUNTS))
     noise = log_uniform(rng, *POSITIONS), log_uniform(rng, *ORIENTATIONS)
@@ -136,7 +136,9 @@ def is_right(answer: TypeAnswer) -> bool:
     return answer.family in RIGHT[answer.true]
 
 
-def identify_cases(seed: int, count: int, progress: Progress, options: Options | None = None) -> Answers:
+def identify_family_cases(
+    seed: int, count: int, progress: Progress, options: Options | None = None
+) -> Answers:
     jobs = [(truth, seed, number) for truth in TRUTHS for number in range(count)]
     found = run_jobs(_identify_job, jobs, progress, "joint-families", "case", options)
     return {
@@ -147,16 +149,16 @@ def identify_cases(seed: int, count: int, progress: Progress, options: Options |
 
 def _identify_job(job: tuple[str, int, int]) -> list[list[TypeAnswer]]:
     solver.prepare(wait=True)
-    case = draw_case(*job)
+    case = draw_family_case(*job)
     return [[identify_case(job[2], case, setting) for setting in SETTINGS]]
 
 
 def run(progress: Progress, options: Options) -> Report:
     count = options.count or (QUICK_CASES if options.quick else CASES)
-    return report_answers(options.seed, identify_cases(options.seed, count, progress, options))
+    return report_families(options.seed, identify_family_cases(options.seed, count, progress, options))
 
 
-def report_answers(seed: int, answers: Answers) -> Report:
+def report_families(seed: int, answers: Answers) -> Report:
     errors = [(given, answer) for (_, given), some in answers.items() for answer in some if _is_error(answer)]
     columns: dict[str, Callable[[tuple[str, TypeAnswer]], Cell]] = {
         "given": lambda one: one[0],
@@ -174,7 +176,7 @@ def report_answers(seed: int, answers: Answers) -> Report:
             "seed": seed,
             "answers": {" ".join(key): [answer.family for answer in some] for key, some in answers.items()},
         },
-        figure=Figure(lambda canvas: draw_answers(canvas, answers), (9.0, 4.0)),
+        figure=Figure(lambda canvas: draw_families(canvas, answers), (9.0, 4.0)),
     )
 
 
@@ -195,7 +197,7 @@ def _share_table(answers: Answers) -> ReportTable:
     return ReportTable("Right families, sure answers and wrong sure answers", head, tuple(rows))
 
 
-def draw_answers(canvas: Canvas, answers: Answers) -> None:
+def draw_families(canvas: Canvas, answers: Answers) -> None:
     axes = canvas.subplots()
     for setting in SETTINGS:
         shares = [_share(answers[truth, setting.title], is_right) for truth in TRUTHS]

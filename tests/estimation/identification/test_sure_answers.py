@@ -8,7 +8,7 @@ from synthetic_recordings import recording
 
 from kineverse.estimation import identify, pose_covariance
 from kineverse.estimation.identification.solver import solver
-from kineverse_studies.experiments.joint_families import draw_case, is_right
+from kineverse_studies.experiments.joint_families import draw_family_case, is_right
 from kineverse_studies.experiments.joint_types import Setting, identify_case
 
 
@@ -25,7 +25,7 @@ from kineverse_studies.experiments.joint_types import Setting, identify_case
 )
 def test_a_sure_answer_is_right(truth: str, number: int, setting: Setting) -> None:
     solver.prepare(wait=True)
-    answer = identify_case(number, draw_case(truth, 0, number), setting)
+    answer = identify_case(number, draw_family_case(truth, 0, number), setting)
     assert is_right(answer) or not answer.is_sure
 
 
