@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from kineverse.compilation import compile
-from kineverse.estimation import ObservedPose, PlausibilityMonitor, Tracker, pose_covariance
+from kineverse.estimation import ImplausibleError, ObservedPose, PlausibilityMonitor, Tracker, pose_covariance
 from kineverse.estimation.tracking.process_model import Process
 from kineverse.expressions.expression import array
 from kineverse.formats import load
@@ -302,6 +302,9 @@ def measure_monitoring(
     rows = [
         _measure("as modelled", model, seeds, long, None),
         _measure("as modelled, white noise", model, seeds, long / 6.0, WHITE),
+        _measure("as modelled, 10 % outliers", model, seeds, long / 6.0, StreamErrors(outliers=0.1)),
+        # The axis is off at first, and the monitor goes on after the repair.
+        _measure("repaired, axis 3 cm off before", model, seeds, long, None, 0.03, False, True),
     ]
     for size in displacements:
         for where, errors in (("", None), (", white noise", WHITE)):
@@ -351,6 +354,7 @@ def _measure(
     errors: StreamErrors | None,
     displacement: float = 0.0,
     same_when_shut: bool = True,
+    is_repaired: bool = False,
 ) -> MonitoringRow:
     delays: list[float] = []
     spent: list[float] = []
@@ -358,20 +362,32 @@ def _measure(
         random = np.random.default_rng(seed)
         stream = _simulate(model, random, duration, errors, displacement, same_when_shut)
         turned = int(np.argmax(stream.angles >= TURNED))
-        monitor = PlausibilityMonitor(model, FRAMES, noise=pose_covariance(POSITION, ORIENTATION))
+        served = model.copy() if is_repaired else model
+        monitor = PlausibilityMonitor(served, FRAMES, noise=pose_covariance(POSITION, ORIENTATION))
+        wrong = is_repaired
         delays.append(np.inf)
         for k, at in enumerate(stream.times):
             look = stream.look(k)
             began = time.thread_time()
             alarm = monitor.update(look, at=at)
             spent.append(1e3 * (time.thread_time() - began))
-            if alarm:
+            if wrong:
+                wrong = k % RATE != 0 or not _repair(served, monitor)
+            elif alarm:
                 delays[-1] = float(k - turned)
                 break
     alarms = int(np.isfinite(delays).sum())
     median, worst = (float(np.median(delays)), float(np.max(delays))) if alarms else (np.nan, np.nan)
     cpu = float(np.mean(spent)), float(np.percentile(spent, 99))
     return MonitoringRow(case, seeds, len(spent), alarms, median, worst, *cpu)
+
+
+def _repair(model: Model, monitor: PlausibilityMonitor) -> bool:
+    """Return True if a report replaces a joint, which takes an alarm and enough of the motion."""
+    try:
+        return bool(monitor.report().repair(model)) if monitor.implausible_since else False
+    except ImplausibleError:
+        return False
 
 
 FIGURE_SIZE = (11.0, 8.0)

@@ -306,14 +306,6 @@ def _check_times(times: npt.ArrayLike | None, count: int) -> Array:
     return stamps
 
 
-@dataclass
-class _MonitoredJoint:
-    """Sequential test of a joint."""
-
-    test: CorrelatedTest
-    begun: int  # number of its first observation
-
-
 class PlausibilityMonitor:
     """Online plausibility test of a model.
 
@@ -347,7 +339,7 @@ class PlausibilityMonitor:
     ) -> None:
         self.model = model
         self.frames = tuple(dict.fromkeys(frames))
-        self.count = 0
+        self.count, self.false_alarms = 0, false_alarms
         self._settings = _TestSettings(
             false_alarms, as_outliers(outliers), relative_to, families, decorrelation_time
         )
@@ -357,14 +349,9 @@ class PlausibilityMonitor:
         self._recent: deque[dict[str, PoseTrack]] = deque(maxlen=keep)
         self._stamps: deque[float] = deque(maxlen=keep)
         self._repairs = {verdict.tag: verdict for verdict in repaired if verdict.replacement is not None}
-        self._monitored: dict[TestableJoint, _MonitoredJoint] = {}
+        self._tests: dict[TestableJoint, CorrelatedTest] = {}
         self._version = model.version
         self._tested = _TestedModel(model, self.frames, self._settings, self._repairs.values())
-
-    @property
-    def false_alarms(self) -> float:
-        """Probability of rejecting a joint that is as served."""
-        return self._settings.false_alarms
 
     @property
     def implausible_since(self) -> dict[str, int]:
@@ -407,10 +394,10 @@ class PlausibilityMonitor:
             self._settings = self._tested.settings = replace(self._settings, stamped=at is not None)
         self._last = time
         for joint, data in self._tested.observe(tracks, np.array([time]), self.count).items():
-            if joint not in self._monitored:
-                test = CorrelatedTest(self._tested.begin_test(data), self._settings.correlation)
-                self._monitored[joint] = _MonitoredJoint(test, self.count)
-            self._monitored[joint].test.add(data.residuals, self.count, time)
+            if joint not in self._tests:
+                test = self._tested.begin_test(data)
+                self._tests[joint] = CorrelatedTest(test, self._settings.correlation, self.count)
+            self._tests[joint].add(data.residuals, self.count, time)
         self._recent.append(tracks)
         self._stamps.append(time)
         self.count += 1
@@ -425,14 +412,14 @@ class PlausibilityMonitor:
             gap = replace(any_track, observed=np.zeros(1, dtype=bool))
             tracks[name] = concatenate_tracks([each.get(name, gap) for each in self._recent])
         begun = dict.fromkeys(self._tested.served, self.count)
-        begun |= {joint: monitored.begun for joint, monitored in self._monitored.items()}
+        begun |= {joint: test.begun for joint, test in self._tests.items()}
         data = self._tested.observe(tracks, np.array(self._stamps), first, begun)
         result = self._tested.report(tracks, data, self._since(), first)
         self._repairs |= {verdict.tag: verdict for verdict in result if verdict.replacement is not None}
         return result
 
     def _since(self) -> dict[TestableJoint, int | None]:
-        return {joint: monitored.test.implausible_since for joint, monitored in self._monitored.items()}
+        return {joint: test.implausible_since for joint, test in self._tests.items()}
 
     def _follow_model(self) -> None:
         """After an edit, find the testable joints, and keep the tests of unchanged ones."""
@@ -440,8 +427,8 @@ class PlausibilityMonitor:
             return
         self._version, before = self.model.version, self._tested
         self._tested = _TestedModel(self.model, self.frames, self._settings, self._repairs.values())
-        unchanged = [joint for joint in self._monitored if self._tested.is_equal(joint, before)]
-        self._monitored = {joint: self._monitored[joint] for joint in unchanged}
+        unchanged = [joint for joint in self._tests if self._tested.is_equal(joint, before)]
+        self._tests = {joint: self._tests[joint] for joint in unchanged}
 
     def _check(self, observed: PosesLike, name: str) -> PoseTrack:
         pose, *covariance = observed if isinstance(observed, tuple) and len(observed) == 2 else (observed,)

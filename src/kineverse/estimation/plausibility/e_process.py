@@ -121,8 +121,9 @@ class SequentialTest:
 class CorrelatedTest:
     """Sequential test of one joint that skips correlated observations; others have the weight of all."""
 
-    def __init__(self, test: SequentialTest, correlation: CorrelationSettings) -> None:
+    def __init__(self, test: SequentialTest, correlation: CorrelationSettings, begun: int) -> None:
         self._test, self._correlation = test, ErrorCorrelation(correlation)
+        self.begun = begun  # number of the first observation
         self._numbers: list[int] = []
         self._owed = 0.0
 
