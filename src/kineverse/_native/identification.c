@@ -1,140 +1,111 @@
-/* Stages of the identification of a joint: fit, maximum of the marginal likelihood, evidence. */
+/* Fit of a joint, and the evidence of a family with its joint values integrated out. */
 
-#include "identification/evidence.h"
+#include "identification/joint_ranges.h"
 
-/* How many numbers of memory a stage needs: covariances with their inverses, two answers with what their
-   observations say apart, and observations three times, which is more than any sum needs. */
-EXPORTED int64_t memory_of(const Problem *p) {
-  int64_t apart = p->joints * (1 + p->joints);
-  return p->widths + 2 * answer_size(p) + p->count * (NOISE + 2 * apart + 3 * OBSERVATION);
+#define ATOM 1e-10
+
+/* How many numbers of memory the functions below need. */
+EXPORTED int64_t memory_of(int64_t count) {
+  return 1000 + count * (72 + 2 * (int64_t)(sizeof(Observation) / sizeof(double)));
 }
 
-/* Every stage begins with the errors as they are, and with what is in its answer; returns free memory. */
-static double *begin_stage(Problem *p, double *memory, double *answer, Answer *a) {
-  watch_begin(&watch, INFINITY);
-  lay(p, answer, a);
-  believe_as(p, a->head);
-  soften(p, p->softer, memory);
-  return memory + NOISE * p->count;
-}
-
-/* As _iterate_ranges in marginal_likelihood.py; leaves what observations say alone; returns free memory. */
-static double *widen_until_settled(Problem *p, Answer *a, Apart *apart, double *memory) {
-  int n = (int)p->joints, believed = a->head->marginal > 0.0;
-  double before[6], *rest = memory;
-  for (int i = 0; i < n; i++) before[i] = 1.0 / sqrt(a->head->belief.precision[i]);
-  for (int64_t turn = 0;; turn++) {
-    double most = 0.0, *wide = apart->deviations;
-    Belief *belief = &a->head->belief;
-    if (turn < p->turns) slide(p, a, memory);
-    rest = take_apart(p, a, apart, memory);
-    for (int i = 0; i < n; i++) most = fmax(most, fabs(log(fmax(wide[i], p->narrowest) / before[i])));
-    if (turn == p->turns || (believed && most < p->settled) || look_at_clock(&watch)) return rest;
-    believed = 1;
-    a->head->marginal = 1.0;
-    for (int i = 0; i < n; i++) {
-      before[i] = fmax(wide[i], p->narrowest);
-      belief->mean[i] = apart->mean[i];
-      belief->precision[i] = 1.0 / (before[i] * before[i]);
+/* Joint values, their covariances and the information of parameters and means, by observations and ranges. */
+static void inform(const Problem *p, const double *x, const double *errors, double weight, const Apart *apart,
+                   double *values, double *covariances, double *information) {
+  int rows = (int)p->rows, joints = (int)p->joints, size = (int)p->size, n = size + joints;
+  double total[UNKNOWNS * UNKNOWNS] = {0}, normal[MOST * MOST] = {0}, right[MOST] = {0};
+  Observation o;
+  for (int64_t k = 0; k < p->count; k++) {
+    const double *C = apart->covariances + joints * joints * k, *S = errors + rows * rows * k;
+    double W[36], moved[36], both[6 * UNKNOWNS] = {0}, weighted[6 * UNKNOWNS] = {0};
+    if (joints) widened(C, joints, apart->deviations, W);
+    for (int i = 0; i < joints; i++) {
+      double square = apart->deviations[i] * apart->deviations[i], change = 0.0;
+      for (int j = 0; j < joints; j++) {
+        double sum = 0.0;
+        for (int l = 0; l < joints; l++) sum += W[joints * i + l] * C[joints * l + j];
+        covariances[joints * joints * k + joints * i + j] = square * sum;
+        change += square * W[joints * i + j] * (apart->values[joints * k + j] - apart->mean[j]);
+      }
+      values[joints * k + i] = o.values[i] = apart->mean[i] + change;
     }
-    go_on(p, a, memory);
-    exchange(p, a, memory);
+    place(p, x, &o, rows);
+    for (int r = 0; r < rows; r++) {
+      for (int s = 0; s < rows; s++) {
+        moved[rows * r + s] = S[rows * r + s];
+        for (int j = 0; j < joints; j++) {
+          const double *J = o.by_joints + 6 * j;
+          moved[rows * r + s] += apart->deviations[j] * apart->deviations[j] * J[r] * J[s];
+        }
+      }
+      memcpy(both + UNKNOWNS * r, o.by_parameters + MOST * r, size * sizeof(double));
+      for (int j = 0; j < joints; j++) both[UNKNOWNS * r + size + j] = o.by_joints[6 * j + r];
+    }
+    invert(moved, rows, W);
+    for (int r = 0; r < rows; r++)
+      for (int s = 0; s < rows; s++)
+        for (int i = 0; i < UNKNOWNS; i++)
+          weighted[UNKNOWNS * r + i] += W[rows * r + s] * both[UNKNOWNS * s + i];
+    for (int i = 0; i < n; i++)
+      for (int r = 0; r < rows; r++)
+        for (int j = 0; j < UNKNOWNS; j++)
+          total[UNKNOWNS * i + j] += both[UNKNOWNS * r + i] * weighted[UNKNOWNS * r + j];
   }
+  believe(p, x, normal, right);
+  for (int i = 0; i < n; i++)
+    for (int j = 0; j < n; j++)
+      information[n * i + j] = weight * total[UNKNOWNS * i + j] + (i == j ? p->regular[i] : 0.0) +
+                               (i < size && j < size ? normal[MOST * i + j] : 0.0);
 }
 
-/* As maximise_marginal_likelihood in marginal_likelihood.py; leaves and returns the same. */
-static double *refine_from(Problem *p, Answer *a, Apart *apart, double *noise, double *memory) {
-  int narrowing = p->softer && !(a->head->marginal > 0.0);
-  Answer other;
-  Apart of_other;
-  if (!p->joints || !size_of(p)) return take_apart(p, a, apart, memory);
-  if (narrowing) {
-    memory = lay(p, memory, &other);
-    copy(p, a, &other);
-  }
-  memory = widen_until_settled(p, a, apart, memory);
-  if (!narrowing) return memory;
-  double *rest = memory;
-  for (int64_t level = 0; level <= p->softer; level++) {
-    soften(p, level, noise);
-    go_on(p, &other, memory);
-    exchange(p, &other, memory);
-    rest = widen_until_settled(p, &other, &of_other, memory);
-  }
-  if (log_evidence(p, &other, &of_other, rest) <= log_evidence(p, a, apart, rest)) return memory;
-  copy(p, &other, a);
-  *apart = of_other;
-  return rest;
+/* The logarithm of the volume of mean poses per unit of the parameters and joint values that move them. A lever
+   of length zero has no volume; a singular value is at least ATOM [m]. */
+static double log_volume(const Problem *p, const double *x, const double *mean) {
+  int rows = (int)p->rows, movers = (int)p->movers, n = movers + (int)p->joints;
+  double square[36], column[36];
+  Observation o;
+  if (movers < 0) return 0.0;
+  memcpy(o.values, mean, p->joints * sizeof(double));
+  place(p, x, &o, rows);
+  for (int i = 0; i < n; i++)
+    for (int r = 0; r < rows; r++)
+      column[6 * i + r] =
+          i < movers ? o.by_parameters[MOST * r + p->mover[i]] : o.by_joints[6 * (i - movers) + r];
+  for (int i = 0; i < n; i++)
+    for (int j = 0; j < n; j++) {
+      square[n * i + j] = i == j ? ATOM * ATOM : 0.0;
+      for (int r = 0; r < rows; r++) square[n * i + j] += column[6 * i + r] * column[6 * j + r];
+    }
+  return log(factorise(square, n));
 }
 
-/* As levenberg_marquardt in least_squares.py. */
-EXPORTED void solve(const Problem *problem, double *memory, double *answer) {
-  Problem p = *problem;
-  Answer a;
-  memory = begin_stage(&p, memory, answer, &a);
-  go_on(&p, &a, memory);
-}
-
-/* As maximum_likelihood in marginal_likelihood.py, from several starts. */
-EXPORTED void likeliest(const Problem *problem, int64_t starts, const Motion *motions, const double *values,
-                        double *memory, double *answer) {
-  Problem p = *problem;
-  Answer a;
-  Apart apart;
-  double *noise = memory;
-  memory = begin_stage(&p, memory, answer, &a);
-  soften(&p, 0, noise);
-  solve_from(&p, starts, motions, values, p.steps, &a, memory);
-  for (int64_t level = 1; level <= p.softer; level++) {
-    soften(&p, level, noise);
-    go_on(&p, &a, memory);
-  }
-  exchange(&p, &a, memory);
-  slide(&p, &a, memory);
-  memory = take_apart(&p, &a, &apart, memory);
-  judge(&p, &a, &apart, memory);
-}
-
-/* As maximise_marginal_likelihood in marginal_likelihood.py. */
-EXPORTED void refine(const Problem *problem, double *memory, double *answer) {
-  Problem p = *problem;
-  Answer a;
-  Apart apart;
-  double *noise = memory;
-  memory = begin_stage(&p, memory, answer, &a);
-  memory = refine_from(&p, &a, &apart, noise, memory);
-  judge(&p, &a, &apart, memory);
-}
-
-/* As continue_from in marginal_likelihood.py. */
-EXPORTED void carry_on(const Problem *problem, double *memory, double *answer) {
-  Problem p = *problem;
-  Answer a;
-  Apart apart;
-  memory = begin_stage(&p, memory, answer, &a);
-  settle_new(&p, &a, memory);
-  go_on(&p, &a, memory);
-  if (!p.marginal) slide(&p, &a, memory);
-  memory = p.marginal ? widen_until_settled(&p, &a, &apart, memory) : take_apart(&p, &a, &apart, memory);
-  judge(&p, &a, &apart, memory);
-}
-
-/* As laplace_evidence in marginal_likelihood.py, for several sizes of the noise; the rest is for the last. The
-   covariance of the errors is the sum of two parts, times the square of a factor each; without parts it is as
-   it is. */
-EXPORTED void rate(const Problem *problem, int64_t sizes, const double *factors, const double *parts,
-                   double *memory, double *answer, double *logs, double *values, double *covariances,
-                   double *information) {
-  Answer a;
-  Apart apart;
-  int64_t numbers = problem->count * problem->rows * problem->rows;
+/* As integrate_joint_values in marginal_likelihood.py, for several sizes of the noise. The covariance of the
+   errors is the sum of two parts, times the square of a factor each; without parts it is as it is. The result is
+   of the last size: log likelihood, widths, means, information, joint values alone and within their ranges, and
+   the covariances of both. */
+EXPORTED void rate(const Problem *p, int64_t sizes, const double *factors, const double *parts, double weight,
+                   double *memory, const double *x, const double *joint_values, const double *residuals,
+                   const double *errors, const double *by_joints, double *logs, double *result) {
+  int64_t joints = p->joints, each = p->count * joints, numbers = p->count * p->rows * p->rows;
+  int n = (int)(p->size + joints);
+  double *log_likelihood = result, *deviations = result + 1, *mean = deviations + joints;
+  double *information = mean + joints, *alone_values = information + n * n, *values = alone_values + each;
+  double *alone_covariances = values + each, *covariances = alone_covariances + each * joints;
+  double *scaled = memory + p->widths + 2 * each, copied[UNKNOWNS * UNKNOWNS];
+  Apart apart = {.values = alone_values, .covariances = alone_covariances};
   watch_begin(&watch, INFINITY);
-  lay(problem, answer, &a);
   for (int64_t i = 0; i < sizes && !look_at_clock(&watch); i++) {
     double place = factors[2 * i] * factors[2 * i], turn = factors[2 * i + 1] * factors[2 * i + 1];
-    for (int64_t k = 0; parts && k < numbers; k++)
-      a.covariances[k] = place * parts[k] + turn * parts[numbers + k];
-    take_apart(problem, &a, &apart, memory);
-    logs[i] = evidence(problem, &a, &apart, values, covariances, information);
+    for (int64_t k = 0; parts && k < numbers; k++) scaled[k] = place * parts[k] + turn * parts[numbers + k];
+    const double *S = parts ? scaled : errors;
+    alone(p, joint_values, residuals, S, by_joints, &apart);
+    if (joints) widths(p, weight, &apart, memory);
+    inform(p, x, S, weight, &apart, values, covariances, information);
+    memcpy(copied, information, n * n * sizeof(double));
+    logs[i] = weight * apart.log_likelihood + apart.log_density + log_volume(p, x, apart.mean) +
+              0.5 * n * log(TAU) - log(factorise(copied, n));
+    *log_likelihood = apart.log_likelihood;
+    memcpy(deviations, apart.deviations, joints * sizeof(double));
+    memcpy(mean, apart.mean, joints * sizeof(double));
   }
 }

@@ -26,7 +26,7 @@ static int is_finite(const double *a, int n) {
   return 1;
 }
 
-/* What the bounds cost before anything is seen, from x with the curved limits there; below 0 if it is unknown. */
+/* Least cost of the prior inside the limits, linearised at x; below 0 if that is not known. */
 static double beyond(const Problem *p, int64_t g, const Work *w) {
   const int n = w->n;
   double triangle[MOST * MOST], inverse[MOST * MOST], step[MOST], mean[MOST];
@@ -50,12 +50,14 @@ static int judge(const Problem *p, int64_t g, Work *w, int loss, double log_inli
   const int64_t *watch = p->watch + p->first_watch[g];
   const int count = (int)(p->first_watch[g + 1] - p->first_watch[g]);
   double matrix[MOST * MOST], vector[MOST], cost = w->trial_cost, half = w->trial_cost;
-  double curved[w->limits * row + 1], before[2 * count + 1];
+  double curved[w->limits * row + 1], squares[count + 1], weights[count + 1];
   memcpy(matrix, w->trial_information, n * n * sizeof(double));
   memcpy(vector, w->trial_prior, n * sizeof(double));
   for (int k = 0; k < count; k++) {
-    before[2 * k] = p->squares[watch[k]], before[2 * k + 1] = p->weights[watch[k]];
-    if (p->mask[watch[k]]) cost += add(p, watch[k], n, loss, log_inlier, matrix, vector, &half);
+    squares[k] = 0.0, weights[k] = 1.0;
+    if (!p->mask[watch[k]]) continue;
+    cost += add(p, watch[k], n, loss, log_inlier, matrix, vector, squares + k, weights + k);
+    half += weights[k] * squares[k] / 2;
   }
   for (int r = 0; r < n; r++)
     for (int c = 0; c < r; c++) matrix[c * n + r] = matrix[r * n + c];
@@ -71,11 +73,10 @@ static int judge(const Problem *p, int64_t g, Work *w, int loss, double log_inli
   }
   if (!is_better) {
     if (!w->is_begun) return 0;
-    for (int k = 0; k < count; k++)
-      p->squares[watch[k]] = before[2 * k], p->weights[watch[k]] = before[2 * k + 1];
     w->damping = fmax(10 * w->damping, 1e-3);
     return 1;
   }
+  for (int k = 0; k < count; k++) p->squares[watch[k]] = squares[k], p->weights[watch[k]] = weights[k];
   memcpy(w->x, w->trial, w->m * sizeof(double));
   memcpy(w->prior, w->trial_prior, n * sizeof(double));
   memcpy(w->information, w->trial_information, n * n * sizeof(double));

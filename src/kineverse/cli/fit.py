@@ -38,8 +38,8 @@ Errors of a camera at 30 Hz are alike in neighbouring rows. The time over which 
 is estimated, and the poses count for as many independent ones as they are worth. --thin N takes N poses,
 evenly over the recording, as independent.
 
-The answer is compared with those for half and twice the noise, and for the noise of the residuals. If it
-depends on these, it is ambiguous, and the other answers are printed.
+The answer is compared with those for twice the noise, and for the noise of the residuals. If it depends on
+these, it is ambiguous, and the other answers are printed.
 
 Joints of all kinds are tried: rigid, prismatic, revolute, screw, cylindrical, spherical, planar, free. Each
 gets its probability, given the observations.

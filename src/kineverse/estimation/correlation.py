@@ -36,39 +36,20 @@ _WINDOW = 3  # cut-off of the sum, in autocorrelation times
 _FIRST, _CHANCE = 5, 2.5
 
 
-def effective_sample_size(residuals: Array) -> int:
-    """Return the effective sample size of residuals (N, m) in order.
-
-    It is N / τ for the component with the largest autocorrelation time τ, and at least 8.
-    """
-    count = len(residuals)
-    return min(count, max(LEAST_EFFECTIVE, round(count / correlation_time(residuals))))
-
-
 def correlation_time(residuals: Array, deviations: float = 0.0) -> float:
-    """Return the autocorrelation time of residuals (N, m) in order, in rows.
+    """Return the autocorrelation time of residuals (N, m) in order, in rows, those of positions first.
 
     The component with the largest one counts, among those that are not small compared with the others of
-    positions or orientations. Outliers are clipped. Twenty rows or fewer have the time 1.
-
-    Parameters
-    ----------
-    residuals
-        The three of positions first.
-    deviations
-        Number of standard deviations that are added to each estimate, for an upper confidence bound.
+    positions or orientations. Outliers are clipped. Twenty rows or fewer have the time 1. For an upper
+    confidence bound, some standard deviations are added to each estimate.
     """
     if len(residuals) <= _LEAST_COUNT:
         return 1.0
-    sizes = np.median(np.abs(residuals), axis=0)
-    kept = [
-        residuals[:, k]
-        for block in (range(3), range(3, residuals.shape[1]))
-        for k in block
-        if k < len(sizes)
-        and sizes[k] > 0.0
-        and sizes[k] >= _SHARE * max(sizes[i] for i in block if i < len(sizes))
-    ]
+    kept = []
+    for block in (residuals[:, :3], residuals[:, 3:]):
+        sizes = np.median(np.abs(block), axis=0)
+        least = max(_SHARE * float(sizes.max(initial=0.0)), np.finfo(float).tiny)
+        kept += list(block[:, sizes >= least].T)
     return max((_component_time(column, deviations) for column in kept), default=1.0)
 
 

@@ -26,7 +26,6 @@ from kineverse.estimation.recordings import (
     identify_recorded_joint,
     read_recording,
 )
-from kineverse.estimation.recordings.recorded_joint import residual_noise
 from kineverse.lie import Array
 from kineverse.view.plots import Figure, FitProjection, draw_axial_view, draw_side_view
 
@@ -125,6 +124,15 @@ class StatementAnswer:
         if not self.is_sure:
             return "cannot tell"
         return "right" if self.family == self.label else "wrong"
+
+
+def residual_noise(fit: Fit) -> ObservationNoise:
+    """Return noise of the size of the residuals. Directions of joint values have none."""
+    (position, orientation), joints = fit.rms, fit.motion.joints
+    if fit.rows == 3:
+        return ObservationNoise(position / math.sqrt(max(1.0, 3.0 - joints)), None, True)
+    root = math.sqrt(max(0.5, 3.0 - 0.5 * joints))
+    return ObservationNoise(position / root, orientation / root, True)
 
 
 def answer_statements(name: str, label: Label, pair: RecordedPair) -> list[StatementAnswer]:

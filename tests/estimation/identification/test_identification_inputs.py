@@ -8,9 +8,10 @@ from synthetic_recordings import recording
 
 import kineverse as kv
 from kineverse.estimation import Identifier, identify, linear_algebra, pose_covariance
-from kineverse.estimation.identification import least_squares, marginal_likelihood
+from kineverse.estimation.identification import least_squares
 from kineverse.estimation.identification.initial_guess import MotionStatistics, initial_guesses
 from kineverse.estimation.identification.observations import check_observations
+from kineverse.estimation.identification.solver import solver
 
 NOISE = pose_covariance(0.01, 0.02)
 SEEN = recording("revolute", count=6, position=0.01, orientation=0.02, seed=0)
@@ -186,10 +187,8 @@ def test_identify_of_degenerate_positions_is_finite(where, whole):
 def test_marginal_likelihood_of_three_positions_is_finite(family):
     data = recording("spherical", count=3, position=0.1, orientation=0.02, seed=3)
     problem = check_observations(data.parent, data.child[:, :3, 3], data.covariance, data.covariance)
-    likeliest = marginal_likelihood.maximum_likelihood(
-        problem, [*initial_guesses(family, MotionStatistics(problem))]
-    ).solution
-    assert np.isfinite(marginal_likelihood.maximise_marginal_likelihood(problem, likeliest).log_evidence)
+    likeliest = solver.maximum_likelihood(problem, [*initial_guesses(family, MotionStatistics(problem))])
+    assert np.isfinite(solver.maximise_marginal_likelihood(problem, likeliest.solution).log_evidence)
 
 
 def test_step_to_a_singular_covariance_is_shortened(monkeypatch):

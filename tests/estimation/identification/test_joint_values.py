@@ -1,4 +1,4 @@
-"""Joint values: revolutions, and mirrored values where positions are much more precise than orientations."""
+"""Revolutions of joint values, and evidence without convergence."""
 
 from __future__ import annotations
 
@@ -7,18 +7,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 from synthetic_recordings import Array, angle_between, noisy, recording, transform
 
 import kineverse as kv
 from kineverse.estimation import IdentificationResult, Identifier, identify, pose_covariance
 from kineverse.estimation.identification.families import JOINT_FAMILIES, GroupMotion
-from kineverse.estimation.identification.joint_values import (
-    choose_mirrored_values,
-    evaluate_each_observation,
-    mirrored_values,
-)
 from kineverse.estimation.identification.least_squares import JointValuePrior, levenberg_marquardt
 from kineverse.estimation.identification.marginal_likelihood import evidence_excess
 from kineverse.estimation.identification.observations import check_observations
@@ -116,28 +110,6 @@ def test_identifier_counts_revolutions(lead: float, family: str) -> None:
     assert np.ptp(fit.range) == pytest.approx(4 * math.tau, abs=0.1)
 
 
-@pytest.mark.parametrize("family", ["prismatic", "revolute"])
-def test_mirrored_joint_values_are_corrected(family: str) -> None:
-    data = recording(
-        family, count=40, position=1e-3, orientation=math.radians(5.0), seed=3, extent=0.4, radius=0.5
-    )
-    problem = check_observations(data.parent, data.child, data.covariance, data.covariance)
-    assert problem.softened
-    motion = GroupMotion(JOINT_FAMILIES[family], 6, data.left, data.right)
-    joint_prior = JointValuePrior(np.zeros(1), np.full(1, 0.12**-2.0), marginal=True)
-    good = levenberg_marquardt(problem, motion, data.values, data.true_parent, joint_prior)
-    parent = good.parent.copy()
-    there = evaluate_each_observation(
-        problem, good.motion, mirrored_values(good.motion, good.values, joint_prior), parent, joint_prior
-    )
-    parent[:10, :3, :3] = there.orientation[:10]
-    bad = levenberg_marquardt(
-        problem, good.motion, np.concatenate([there.values[:10], good.values[10:]]), parent, joint_prior
-    )
-    assert bad.cost > good.cost + 1.0
-    assert choose_mirrored_values(problem, bad).cost < good.cost + 0.1 * (bad.cost - good.cost)
-
-
 def test_evidence_of_an_unconverged_solution_is_reduced() -> None:
     data = recording("planar", count=20, position=1e-3, orientation=0.05, seed=3)
     problem = check_observations(data.parent, data.child, data.covariance, data.covariance)
@@ -150,31 +122,3 @@ def test_evidence_of_an_unconverged_solution_is_reduced() -> None:
     assert evidence_excess(late) == 0.0
     # At the last step the quadratic approximation holds.
     assert evidence_excess(replace(late, converged=False)) < 0.1
-
-
-@pytest.mark.parametrize("family", ["prismatic", "revolute"])
-def test_single_observation_agrees_with_scipys_least_squares(family: str) -> None:
-    data = recording(family, count=5, position=0.01, orientation=0.05, seed=2)
-    problem = check_observations(data.parent, data.child, data.covariance, data.covariance)
-    motion = GroupMotion(JOINT_FAMILIES[family], 6, data.left, data.right)
-    joint_prior = JointValuePrior(np.zeros(1), np.full(1, 0.2**-2.0))
-    identified = evaluate_each_observation(problem, motion, data.values, data.parent, joint_prior)
-    deviation = np.sqrt(np.diag(data.covariance))
-
-    def errors(unknown: np.ndarray, k: int) -> np.ndarray:
-        there = transform(Rotation.from_rotvec(unknown[4:]), unknown[1:4])
-        result = [unknown[:1] / 0.2]
-        for pose, true in (
-            (data.parent[k], there),
-            (data.child[k], there @ motion.linearise(unknown[None, :1]).pose[0]),
-        ):
-            turned = Rotation.from_matrix(pose[:3, :3] @ true[:3, :3].T).as_rotvec()
-            result.append(np.concatenate([pose[:3, 3] - true[:3, 3], turned]) / deviation)
-        return np.concatenate(result)
-
-    for k, parent in enumerate(data.true_parent):
-        start = [data.values[k, 0], *parent[:3, 3], *Rotation.from_matrix(parent[:3, :3]).as_rotvec()]
-        theirs = least_squares(errors, start, args=(k,))
-        assert identified.values[k, 0] == pytest.approx(theirs.x[0], abs=1e-3)
-        turned = Rotation.from_matrix(identified.orientation[k]) * Rotation.from_rotvec(theirs.x[4:]).inv()
-        assert turned.magnitude() < 1e-3

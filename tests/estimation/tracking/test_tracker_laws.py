@@ -327,13 +327,14 @@ def test_compiled_and_numpy_updates_agree_on_inliers():
 @pytest.mark.sampled(2)
 @pytest.mark.compiler
 @pytest.mark.parametrize(("gross", "steps"), [(0.1, 4), (1.0, 8)])
-def test_compiled_and_numpy_updates_agree_on_outliers(gross, steps):
+def test_compiled_and_numpy_updates_agree_on_outliers(gross, steps, monkeypatch):
     model = kv.load("kitchen")
     observer = NoisyObserver(model, [f for f in model.frames if model.speeds_of(f)], 0.02, np.radians(2))
     observed = [ObservedPose(f, covariance=observer.covariance) for f in observer.frames]
     fast, slow = (Tracker(model, observed, outliers=Outliers(0.3)) for _ in range(2))
     slow._update_step.native = None
     assert fast.wait()
+    monkeypatch.setattr(fast._update_step.solver, "update", None)  # all of it runs in C
     rng = np.random.default_rng(3)
     truth = {str(s): rng.uniform(*fast.limits[s]) for s in fast.symbols}
     for _ in range(steps):

@@ -1,21 +1,22 @@
-/* Most likely means and widths of the ranges of joint values. */
+/* Joint values of each observation, the ranges of their values, and the information of the parameters. */
 #pragma once
 #include "levenberg_marquardt.h"
 
-/* Observations alone, and the width of the motion: PerObservation and JointRanges in joint_values.py. */
+/* PerObservation and JointRanges in joint_values.py. */
 typedef struct {
   double *values, *covariances, log_likelihood, deviations[6], mean[6], log_density;
 } Apart;
 
-/* As solve_per_observation in joint_values.py. The log likelihood is times the weight of observations. */
-static void alone(const Problem *p, const Answer *a, Apart *apart) {
+/* As solve_per_observation in joint_values.py. */
+static void alone(const Problem *p, const double *joint_values, const double *residuals, const double *errors,
+                  const double *by_joints, Apart *apart) {
   int m = (int)p->rows, n = (int)p->joints;
   double log_likelihood = 0.0, *values = apart->values, *covariances = apart->covariances;
-  memcpy(values, a->values, p->count * n * sizeof(double));
+  memcpy(values, joint_values, p->count * n * sizeof(double));
   for (int64_t k = 0; k < p->count; k++) {
-    const double *J = a->by_joints + m * n * k, *e = a->residuals + m * k;
+    const double *J = by_joints + m * n * k, *e = residuals + m * k;
     double W[36], weighted[36], curvature[36], slope[6], left[6], *C = covariances + n * n * k;
-    double root = invert(a->covariances + m * m * k, m, W);
+    double root = invert(errors + m * m * k, m, W);
     for (int i = 0; i < n; i++) {
       slope[i] = 0.0;
       for (int r = 0; r < m; r++) {
@@ -42,59 +43,38 @@ static void alone(const Problem *p, const Answer *a, Apart *apart) {
     /* |C| is one over the square of the root that is known. */
     log_likelihood -= 0.5 * squared(left, W, m) + log(root * known) + 0.5 * (m - n) * log(TAU);
   }
-  apart->log_likelihood = p->weight * log_likelihood;
+  apart->log_likelihood = log_likelihood;
 }
 
-/* Fold products of at most eight weights into a logarithm: so many are far from what a double can hold. */
-static double logs_of(double *product) {
-  double sum = log(product[0] * product[1] * product[2]) + log(product[3] * product[4] * product[5]) +
-               log(product[6] * product[7]);
-  for (int l = 0; l < 8; l++) product[l] = 1.0;
-  return sum;
-}
-
-/* The log of the density of values around 0 at a width, with their mean integrated out; eight at once. */
+/* The log of the density of values around 0 at a width, with their mean integrated out. */
 static double density(int64_t count, const double *values, const double *variances, double width,
                       double observation_weight) {
-  double s0[8] = {0}, s1[8] = {0}, s2[8] = {0}, product[8] = {1, 1, 1, 1, 1, 1, 1, 1};
-  double square = width * width, logs = 0.0;
-  int64_t whole = count - count % 8;
-  for (int64_t i = 0; i < whole; i += 8) {
-    for (int l = 0; l < 8; l++) {
-      double weight = 1.0 / (variances[i + l] + square), pulled = weight * values[i + l];
-      s0[l] += weight;
-      s1[l] += pulled;
-      s2[l] += pulled * values[i + l];
-      product[l] *= weight;
+  double s0 = 0.0, s1 = 0.0, s2 = 0.0, product = 1.0, logs = 0.0;
+  for (int64_t i = 0; i < count; i++) {
+    double weight = 1.0 / (variances[i] + width * width), pulled = weight * values[i];
+    s0 += weight;
+    s1 += pulled;
+    s2 += pulled * values[i];
+    product *= weight;
+    if (i % 8 == 7) { /* so many are far from what a double can hold */
+      logs += log(product);
+      product = 1.0;
     }
-    if (i % 64 == 56) logs += logs_of(product);
   }
-  for (int64_t i = whole; i < count; i++) {
-    double weight = 1.0 / (variances[i] + square), pulled = weight * values[i];
-    s0[i - whole] += weight;
-    s1[i - whole] += pulled;
-    s2[i - whole] += pulled * values[i];
-    product[i - whole] *= weight;
-  }
-  logs += logs_of(product);
-  for (int l = 1; l < 8; l++) {
-    s0[0] += s0[l];
-    s1[0] += s1[l];
-    s2[0] += s2[l];
-  }
-  return 0.5 * (observation_weight * (logs - (s2[0] - s1[0] * s1[0] / s0[0])) - log(s0[0]));
+  logs += log(product);
+  return 0.5 * (observation_weight * (logs - (s2 - s1 * s1 / s0)) - log(s0));
 }
 
 /* The best width of several columns of values, and the logarithm of the mean over all of them relative to the
    best. */
-static double widest(const Problem *p, int64_t columns, const double *values, const double *variances,
+static double widest(const Problem *p, double weight, int64_t columns, const double *values, const double *variances,
                      double *logs, double *deviation) {
   int64_t top = 0, count = p->count;
   double sum = 0.0, best;
   for (int64_t g = 0; g < p->widths; g++) {
     logs[g] = 0.0;
     for (int64_t c = 0; c < columns; c++)
-      logs[g] += density(count, values + count * c, variances + count * c, p->grid[g], p->weight);
+      logs[g] += density(count, values + count * c, variances + count * c, p->grid[g], weight);
     if (logs[g] > logs[top]) top = g;
   }
   best = log(p->grid[top]);
@@ -116,14 +96,14 @@ INLINE double widened(const double *covariance, int n, const double *deviations,
 }
 
 /* As fit_joint_ranges in joint_values.py. */
-static void widths(const Problem *p, Apart *apart, double *memory) {
+static void widths(const Problem *p, double weight, Apart *apart, double *memory) {
   int n = (int)p->joints;
   const double *values = apart->values, *covariances = apart->covariances;
   double *deviations = apart->deviations, *mean = apart->mean;
   int64_t count = p->count;
   double result = 0.0, normal[36] = {0}, right[6] = {0}, inverse[36], W[36];
   double *variances = memory + count * n, *logs = variances + count * n;
-  for (int64_t kind = 0; kind < 2; kind++) {
+  for (int64_t kind = 0; kind < ALL; kind++) {
     int64_t columns = 0;
     double width;
     for (int j = 0; j < n; j++) {
@@ -136,7 +116,7 @@ static void widths(const Problem *p, Apart *apart, double *memory) {
       }
     }
     if (!columns) continue;
-    result += widest(p, columns, memory, variances, logs, &width);
+    result += widest(p, weight, columns, memory, variances, logs, &width);
     for (int j = 0; j < n; j++)
       if (p->kind[j] == kind) deviations[j] = width;
   }
@@ -156,18 +136,8 @@ static void widths(const Problem *p, Apart *apart, double *memory) {
   for (int64_t k = 0; k < count; k++) {
     double off[6], root = widened(covariances + n * n * k, n, deviations, W);
     for (int i = 0; i < n; i++) off[i] = values[n * k + i] - mean[i];
-    result -= p->weight * (0.5 * squared(off, W, n) + log(root) + 0.5 * n * log(TAU));
+    result -= weight * (0.5 * squared(off, W, n) + log(root) + 0.5 * n * log(TAU));
   }
   apart->log_density = result;
 }
 
-/* Both of them, in memory of their own; returns what is free behind it. */
-static double *take_apart(const Problem *p, const Answer *a, Apart *apart, double *memory) {
-  apart->values = memory;
-  apart->covariances = memory + p->count * p->joints;
-  memory = apart->covariances + p->count * p->joints * p->joints;
-  alone(p, a, apart);
-  apart->log_density = 0.0;
-  if (p->joints) widths(p, apart, memory);
-  return memory;
-}

@@ -1,21 +1,6 @@
 /* Levenberg-Marquardt step of the parameters, with the joint values eliminated. */
 #pragma once
-#include "log_determinant_gradient.h"
-
-static void advance(const Problem *p, const Motion *m, const double *step, Motion *to) {
-  double l[6] = {0}, r[6] = {0}, turned[9], moved[3];
-  for (int i = 0; i < p->lefts; i++) l[p->left[i]] = step[i];
-  for (int i = 0; i < p->rights; i++) r[p->right[i]] = step[p->lefts + i];
-  to->pitch = m->pitch + (p->pitches ? step[p->lefts + p->rights] : 0.0);
-  exponential(l + 3, turned);
-  times33(m->left_R, turned, to->left_R);
-  apply(m->left_R, l, moved);
-  for (int i = 0; i < 3; i++) to->left_p[i] = m->left_p[i] + moved[i];
-  exponential(r + 3, turned);
-  times33(turned, m->right_R, to->right_R);
-  apply(turned, m->right_p, moved);
-  for (int i = 0; i < 3; i++) to->right_p[i] = moved[i] + r[i];
-}
+#include "linearisation.h"
 
 /* Eliminate the joint values of an observation: W - W J_a (J_a' W J_a + P)^-1 J_a' W is what is left. */
 INLINE int eliminate(const Problem *p, Observation *o, double damping, double *left, const int rows) {
@@ -25,11 +10,8 @@ INLINE int eliminate(const Problem *p, Observation *o, double damping, double *l
   double curvature[36];
   for (int i = 0; i < joints * joints; i++) curvature[i] = o->curvature[i];
   for (int i = 0; i < joints; i++)
-    curvature[(joints + 1) * i] += p->belief.precision[i] + damping * curvature[(joints + 1) * i];
-  if (joints == 1) {
-    if (!(curvature[0] > 0.0)) return 0;
-    o->inverse[0] = 1.0 / curvature[0];
-  } else if (invert(curvature, joints, o->inverse) == 0.0) return 0;
+    curvature[(joints + 1) * i] += p->precision[i] + damping * curvature[(joints + 1) * i];
+  if (invert(curvature, joints, o->inverse) == 0.0) return 0;
   for (int i = 0; i < joints; i++) {
     double *gains = o->gains + 6 * i;
     for (int r = 0; r < rows; r++) gains[r] = 0.0;
@@ -41,29 +23,64 @@ INLINE int eliminate(const Problem *p, Observation *o, double damping, double *l
   return 1;
 }
 
+/* Take half the slope of log |T| of one observation off the right side, T = S + J_a P^-1 J_a'.
+
+   With Π = T^-1 and the gains G = P^-1 J_a' Π, d log |T| = tr(Π dS) + 2 tr(G dJ_a). S depends on the lever h of
+   the parent alone, tr(Π dS) = 2 q·dh. Joint values follow the parameters by the gains. */
+INLINE void widen(const Problem *p, const double *x, const Observation *o, const double *left, double *right,
+                  const int rows) {
+  double input[STATES + ALL + 6 * ALL + 3], output[STEPS + ALL], *V = fill(p, x, o->values, input);
+  double *q = V + 6 * p->all_joints;
+  memset(V, 0, (6 * p->all_joints + 3) * sizeof(double));
+  for (int64_t j = 0; j < p->joints; j++)
+    memcpy(V + 6 * p->joint[j], o->gains + 6 * j, rows * sizeof(double));
+  if (p->parent_covariance) {
+    /* The lower left of Σ_A Mᵀ Π, where Mᵀ Π is Π with [h]x times its upper rows added to the lower. */
+    const double h[3] = {o->H[3], o->H[7], o->H[11]};
+    double Q[9];
+    for (int s = 0; s < 3; s++) {
+      double above[3] = {left[s], left[rows + s], left[2 * rows + s]}, below[3];
+      cross(h, above, below);
+      for (int i = 0; i < 3; i++) {
+        Q[3 * i + s] = 0.0;
+        for (int r = 0; r < rows; r++) Q[3 * i + s] += o->of_parent[6 * (3 + i) + r] * left[rows * r + s];
+        for (int r = 0; r < 3; r++) Q[3 * i + s] += o->of_parent[6 * (3 + i) + 3 + r] * below[r];
+      }
+    }
+    q[0] = Q[7] - Q[5];
+    q[1] = Q[2] - Q[6];
+    q[2] = Q[3] - Q[1];
+  }
+  call(p->slope, input, output);
+  for (int64_t i = 0; i < p->size; i++) {
+    right[i] -= output[p->parameter[i]];
+    for (int64_t j = 0; j < p->joints; j++)
+      for (int r = 0; r < rows; r++)
+        right[i] += output[p->steps + p->joint[j]] * o->gains[6 * j + r] * o->by_parameters[MOST * r + i];
+  }
+}
+
 /* Add what one observation says about the parameters. */
 INLINE void gather(const Problem *p, Observation *o, const double *left, double *normal, double *right,
                    const int rows) {
-  int joints = (int)p->joints, n = (int)size_of(p);
+  int joints = (int)p->joints, n = (int)p->size;
   double pushed[6], rotated[6 * MOST];
   for (int r = 0; r < rows; r++) {
     pushed[r] = 0.0;
     for (int s = 0; s < rows; s++) pushed[r] += o->weights[rows * r + s] * o->residual[s];
   }
   for (int i = 0; i < joints; i++) {
-    o->slope[i] = -p->belief.precision[i] * (o->values[i] - p->belief.mean[i]);
+    o->slope[i] = -p->precision[i] * (o->values[i] - p->mean[i]);
     for (int r = 0; r < rows; r++) o->slope[i] += o->weighted[6 * i + r] * o->residual[r];
-  }
-  for (int i = 0; i < joints; i++)
     for (int r = 0; r < rows; r++) pushed[r] -= o->gains[6 * i + r] * o->slope[i];
+  }
   for (int r = 0; r < rows; r++)
     for (int i = 0; i < MOST; i++) {
       double sum = 0.0;
       for (int s = 0; s < rows; s++) sum += left[rows * r + s] * o->by_parameters[s * MOST + i];
       rotated[r * MOST + i] = sum;
+      right[i] += o->by_parameters[r * MOST + i] * pushed[r];
     }
-  for (int r = 0; r < rows; r++)
-    for (int i = 0; i < MOST; i++) right[i] += o->by_parameters[r * MOST + i] * pushed[r];
   for (int i = 0; i < n; i++)
     for (int r = 0; r < rows; r++) {
       double by = o->by_parameters[r * MOST + i];
@@ -71,111 +88,86 @@ INLINE void gather(const Problem *p, Observation *o, const double *left, double 
     }
 }
 
-/* Beforehand levers are within reach, and pitches ordinary. */
-static void believe(const Problem *p, const Motion *m, double *normal, double *right) {
-  int n = (int)size_of(p);
-  double scale = 1.0 / (p->reach_scale * p->reach_scale);
-  for (int i = 0; i < p->reach; i++) {
-    double row[MOST] = {0};
-    for (int j = 0; j < p->rights; j++) {
-      int64_t c = p->right[j];
-      double unit[3] = {0}, moved[3];
-      if (c >= 3) {
-        unit[c - 3] = 1.0;
-        cross(unit, m->right_p, moved);
-        row[p->lefts + j] = moved[i];
-      } else row[p->lefts + j] = c == i;
-    }
-    for (int j = 0; j < n; j++) {
-      right[j] -= scale * row[j] * m->right_p[i];
-      for (int l = 0; l < n; l++) normal[MOST * j + l] += scale * row[j] * row[l];
-    }
-  }
-  if (!p->pitches) return;
-  scale = 1.0 / (p->pitch_scale * p->pitch_scale);
-  right[n - 1] -= scale * m->pitch;
-  normal[(MOST + 1) * (n - 1)] += scale;
-}
-
-/* Move joint value and parent of an observation as a step of the parameters tells; returns the gain. */
+/* Move joint values and parent of an observation as a step of the parameters tells; returns the gain. */
 INLINE double follow(const Problem *p, const Observation *o, const double *step, Observation *q,
                      const int rows) {
-  int joints = (int)p->joints, n = (int)size_of(p);
-  double left[6], gain = 0.0;
+  int joints = (int)p->joints, n = (int)p->size;
+  double left[6], gain = 0.0, back[6];
   for (int r = 0; r < rows; r++) {
     left[r] = o->residual[r];
     for (int i = 0; i < n; i++) left[r] -= o->by_parameters[r * MOST + i] * step[i];
   }
-  double change[6] = {0}, back[6];
   for (int i = 0; i < joints; i++) {
-    back[i] = -p->belief.precision[i] * (o->values[i] - p->belief.mean[i]);
+    back[i] = -p->precision[i] * (o->values[i] - p->mean[i]);
     for (int r = 0; r < rows; r++) back[i] += o->weighted[6 * i + r] * left[r];
   }
-  for (int i = 0; i < joints; i++)
+  for (int i = 0; i < joints; i++) {
+    double change = 0.0;
     for (int j = 0; j < joints; j++) {
-      change[i] += o->inverse[joints * i + j] * back[j];
+      change += o->inverse[joints * i + j] * back[j];
       gain += o->slope[i] * o->inverse[joints * i + j] * o->slope[j];
     }
-  for (int i = 0; i < joints; i++) {
-    double d = change[i];
-    for (int r = 0; r < rows; r++) left[r] -= o->by_joints[6 * i + r] * d;
-    if (p->joint[i] >= 3) d = d > 0.5 ? 0.5 : d < -0.5 ? -0.5 : d;
-    q->values[i] = o->values[i] + d;
+    for (int r = 0; r < rows; r++) left[r] -= o->by_joints[6 * i + r] * change;
+    change = fmin(fmax(change, -p->largest[i]), p->largest[i]);
+    q->values[i] = fmin(fmax(o->values[i] + change, p->lower[i]), p->upper[i]);
   }
-  memcpy(q->parent_R, o->parent_R, sizeof o->parent_R);
-  memcpy(q->parent_p, o->parent_p, sizeof o->parent_p);
-  if (p->known) return gain;
+  memcpy(q->parent, o->parent, sizeof o->parent);
+  if (!p->parent_covariance) return gain;
   /* ε = e_A + Σ_A Mᵀ W rest */
-  double rest[6] = {0}, carried[6], moved[3], error[6], R[9];
+  double rest[6] = {0}, carried[6], input[18];
   for (int r = 0; r < rows; r++)
     for (int s = 0; s < rows; s++) rest[r] += o->weights[rows * r + s] * left[s];
-  cross(o->lever, rest, moved);
+  const double h[3] = {o->H[3], o->H[7], o->H[11]};
+  cross(h, rest, carried + 3);
   for (int i = 0; i < 3; i++) {
     carried[i] = rest[i];
-    carried[3 + i] = moved[i] + rest[3 + i];
+    carried[3 + i] += rest[3 + i];
   }
+  memcpy(input, o->parent, 12 * sizeof(double));
   for (int i = 0; i < 6; i++) {
-    error[i] = o->own[i];
-    for (int j = 0; j < 6; j++) error[i] += o->of_parent[6 * i + j] * carried[j];
-    gain += error[i] * error[i] / o->of_parent[7 * i];
+    double error = o->own[i];
+    for (int j = 0; j < 6; j++) error += o->of_parent[6 * i + j] * carried[j];
+    gain += error * error / o->of_parent[7 * i];
+    input[12 + i] = error;
   }
-  exponential(error + 3, R);
-  times33(o->parent_R, R, q->parent_R);
-  apply(o->parent_R, error, moved);
-  for (int i = 0; i < 3; i++) q->parent_p[i] = o->parent_p[i] + moved[i];
+  call(p->turn_parent, input, q->parent);
   return gain;
 }
 
-INLINE int move_rows(const Problem *p, const Motion *m, Observation *all, double damping, Motion *to,
+INLINE int move_rows(const Problem *p, const double *x, Observation *all, double damping, double *to,
                      Observation *next, double *gain, const int rows) {
-  int n = (int)size_of(p);
-  double normal[MOST * MOST] = {0}, right[MOST] = {0}, step[MOST] = {0}, packed[MOST * MOST], left[36];
+  int n = (int)p->size;
+  double normal[MOST * MOST] = {0}, right[MOST] = {0}, step[MOST], packed[MOST * MOST], left[36];
   for (int64_t k = 0; k < p->count; k++) {
     Observation *o = all + k;
-    if (p->marginal) {
+    if (p->marginal && n) {
       if (!eliminate(p, o, 0.0, left, rows)) return 0;
-      widen(p, m, o, left, right, rows);
+      widen(p, x, o, left, right, rows);
     }
-    if (!p->marginal || damping > 0.0)
+    if (!(p->marginal && n) || damping > 0.0)
       if (!eliminate(p, o, damping, left, rows)) return 0;
     gather(p, o, left, normal, right, rows);
   }
-  believe(p, m, normal, right);
+  believe(p, x, normal, right);
   for (int i = 0; i < n; i++)
     for (int j = 0; j < n; j++) packed[n * i + j] = normal[MOST * i + j] * (i == j ? 1.0 + damping : 1.0);
-  memcpy(step, right, n * sizeof(double));
+  memcpy(step, right, sizeof step);
   if (factorise(packed, n) == 0.0) return 0;
   resolve(packed, n, step);
   *gain = 0.0;
   for (int i = 0; i < n; i++) *gain += step[i] * right[i];
   for (int64_t k = 0; k < p->count; k++) *gain += follow(p, all + k, step, next + k, rows);
-  advance(p, m, step, to);
+  double input[STATES + STEPS] = {0};
+  memcpy(input, x, p->states * sizeof(double));
+  memcpy(to, x, p->states * sizeof(double));
+  for (int i = 0; i < n; i++) input[p->states + p->parameter[i]] = step[i];
+  if (n) call(p->retract, input, to);
   return 1;
 }
 
 /* Where a step leads; 0 if there is none. */
-static int move(const Problem *p, const Motion *m, Observation *all, double damping, Motion *to,
+static int move(const Problem *p, const double *x, Observation *all, double damping, double *to,
                 Observation *next, double *gain) {
-  return p->rows == 6 ? move_rows(p, m, all, damping, to, next, gain, 6)
-                      : move_rows(p, m, all, damping, to, next, gain, 3);
+  return p->rows == 6 ? move_rows(p, x, all, damping, to, next, gain, 6)
+                      : move_rows(p, x, all, damping, to, next, gain, 3);
 }

@@ -38,33 +38,6 @@ static int call(Function compute, const double *input, double *one, double *two,
   return compute(arguments, results, NULL, NULL, 0);
 }
 
-/* The inverse of any matrix, which is lost; 0 if there is none. */
-static int invert_any(double *a, double *inverse, int n) {
-  for (int i = 0; i < n * n; i++) inverse[i] = i % (n + 1) == 0;
-  for (int c = 0; c < n; c++) {
-    int best = c;
-    for (int r = c + 1; r < n; r++)
-      if (fabs(a[r * n + c]) > fabs(a[best * n + c])) best = r;
-    if (!(fabs(a[best * n + c]) > 0.0)) return 0;
-    for (int k = 0; k < n; k++) {
-      const double u = a[c * n + k], v = inverse[c * n + k];
-      a[c * n + k] = a[best * n + k], a[best * n + k] = u;
-      inverse[c * n + k] = inverse[best * n + k], inverse[best * n + k] = v;
-    }
-    const double pivot = a[c * n + c];
-    for (int k = 0; k < n; k++) a[c * n + k] /= pivot, inverse[c * n + k] /= pivot;
-    for (int r = 0; r < n; r++) {
-      const double much = a[r * n + c];
-      if (r == c || much == 0.0) continue;
-      for (int k = 0; k < n; k++) {
-        a[r * n + k] -= much * a[c * n + k];
-        inverse[r * n + k] -= much * inverse[c * n + k];
-      }
-    }
-  }
-  return 1;
-}
-
 /* What leads back from how the tangent turns on the way: x becomes where a step along the rates ends, back is
    the inverse of R(x)⁺ ∂x/∂step; 0 if it cannot be followed. */
 static int follow(const Problem *p, int64_t g, double *x, const double *step, double *back) {
@@ -72,6 +45,7 @@ static int follow(const Problem *p, int64_t g, double *x, const double *step, do
   const double *known = p->input + p->coordinates, *bend = p->bend + p->first_bend[g];
   double input[2 * MOST + p->known], rates[MOST * MOST], slope[MOST * MOST], gain[MOST * MOST];
   double by_step[MOST * MOST], further[MOST], after[MOST], squares[MOST * MOST], turn[MOST * MOST];
+  double normal[MOST * MOST];
   memcpy(input, x, m * sizeof(double));
   memcpy(input + m, known, p->known * sizeof(double));
   if (call(p->rates[g], input, rates, NULL, NULL)) return 0;
@@ -97,23 +71,30 @@ static int follow(const Problem *p, int64_t g, double *x, const double *step, do
   memcpy(x, input, m * sizeof(double));
   memcpy(input + m, known, p->known * sizeof(double));
   if (call(p->rates[g], input, rates, NULL, NULL)) return 0;
-  /* R⁺ = (RᵀR)⁻¹Rᵀ, as no direction is lost. */
+  /* back = (RᵀB)⁻¹ RᵀR for B = ∂x/∂step, by normal equations, as no direction is lost. */
   for (int r = 0; r < n; r++)
     for (int c = 0; c < n; c++) {
-      double sum = 0.0;
-      for (int i = 0; i < m; i++) sum += rates[i * n + r] * rates[i * n + c];
-      squares[r * n + c] = sum;
+      turn[r * n + c] = squares[r * n + c] = 0.0;
+      for (int i = 0; i < m; i++) {
+        turn[r * n + c] += rates[i * n + r] * by_step[i * n + c];
+        squares[r * n + c] += rates[i * n + r] * rates[i * n + c];
+      }
     }
-  if (!factor(squares, n)) return 0;
+  for (int r = 0; r < n; r++)
+    for (int c = 0; c < n; c++) {
+      normal[r * n + c] = back[r * n + c] = 0.0;
+      for (int i = 0; i < n; i++) {
+        normal[r * n + c] += turn[i * n + r] * turn[i * n + c];
+        back[r * n + c] += turn[i * n + r] * squares[i * n + c];
+      }
+    }
+  if (!factor(normal, n)) return 0;
   for (int c = 0; c < n; c++) {
-    for (int r = 0; r < n; r++) {
-      further[r] = 0.0;
-      for (int i = 0; i < m; i++) further[r] += rates[i * n + r] * by_step[i * n + c];
-    }
-    solve(squares, further, n);
-    for (int r = 0; r < n; r++) turn[r * n + c] = further[r];
+    for (int r = 0; r < n; r++) further[r] = back[r * n + c];
+    solve(normal, further, n);
+    for (int r = 0; r < n; r++) back[r * n + c] = further[r];
   }
-  return invert_any(turn, back, n);
+  return 1;
 }
 
 /* Move x by a step, and into the bounds; returns 2 if the tangent turns, 1 if not, 0 if it cannot be done. */

@@ -1,7 +1,7 @@
 /* Quadratic program of at most MOST unknowns between at most ROWS bounds.
 
-   It is small, dense and starts at its free minimum, which is the solution of nearly all of them. A library of
-   quadratic programs has no header here and allocates memory for each. */
+   It is small, dense and starts at its free minimum, which mostly is the solution. Libraries of quadratic
+   programs have no header here, and allocate memory for each. */
 #pragma once
 #include "../definitions.h"
 

@@ -23,7 +23,7 @@ static void logarithm(const double r[9], double v[3]) {
 
 enum { GAUSSIAN, CAUCHY, MIXTURE };
 
-/* Whether a residual counts as an inlier with this probability; its cost is the negative log density. */
+/* Weight of a residual, and its cost: the negative log density. */
 static double weigh(const Problem *p, int64_t i, int loss, double log_inlier, double square, double *cost) {
   const double size = (double)p->size[i];
   *cost = square / 2;
@@ -38,10 +38,9 @@ static double weigh(const Problem *p, int64_t i, int loss, double log_inlier, do
   return exp(inlier - total);
 }
 
-/* Add one weighted observation to the lower triangle of a matrix, a vector and half its square to the sum;
-   return its cost. */
+/* Add one weighted observation to the lower triangle of a matrix and to a vector; return its cost. */
 static double add(const Problem *p, int64_t i, int n, int loss, double log_inlier, double *matrix,
-                  double *vector, double *half) {
+                  double *vector, double *residual, double *weight) {
   const int d = (int)p->size[i];
   const double *value = p->output + p->value[i], *slope = p->output + p->slope[i];
   const double *z = p->numbers + p->seen[i], *white = p->whitening + p->white[i];
@@ -77,22 +76,20 @@ static double add(const Problem *p, int64_t i, int n, int loss, double log_inlie
     double e = 0.0, *row = rows + a * n;
     for (int c = 0; c < n; c++) row[c] = 0.0;
     for (int b = 0; b <= a; b++) {
-      const double weight = white[a * d + b];
-      if (weight == 0.0) continue;
+      const double w = white[a * d + b];
+      if (w == 0.0) continue;
       const double *from = p->is_pose[i] && b > 2 ? turned + (b - 3) * n : slope + b * n;
-      e += weight * error[b];
-      for (int c = 0; c < n; c++) row[c] += weight * from[c];
+      e += w * error[b];
+      for (int c = 0; c < n; c++) row[c] += w * from[c];
     }
     whitened[a] = e;
     square += e * e;
   }
-  const double weight = weigh(p, i, loss, log_inlier, square, &cost);
-  p->squares[i] = square, p->weights[i] = weight;
-  *half += weight * square / 2;
+  *residual = square, *weight = weigh(p, i, loss, log_inlier, square, &cost);
   for (int a = 0; a < d; a++) {
     const double *row = rows + a * n;
     for (int r = 0; r < n; r++) {
-      const double much = weight * row[r];
+      const double much = *weight * row[r];
       if (much == 0.0) continue; /* most links move with few coordinates */
       vector[r] += much * whitened[a];
       for (int c = 0; c <= r; c++) matrix[r * n + c] += much * row[c];

@@ -354,12 +354,8 @@ def fit_curve(
 
 
 def continue_curve(observations: Observations, before: Solution[FamilyMember]) -> Scored:
-    """Return the curve with the knots of an earlier one, for the same observations or more."""
-    motion, known, values = _as_curve(before), len(before.values), before.values
-    if known < len(observations):
-        new = observations.select(slice(known, None))
-        values = np.concatenate([values, _nearest(new, _deviations(before.covariance), motion)])
-    return _scored(observations, motion, values)
+    """Return the curve with the knots and joint values of an earlier one."""
+    return _scored(observations, _as_curve(before), before.values)
 
 
 def _scored(observations: Observations, motion: CurveMotion, values: Array) -> Scored:

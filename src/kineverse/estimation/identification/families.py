@@ -6,10 +6,14 @@ Each joint value is one of the six components of (v, ω), and these components d
 screw, v_z also gets the pitch times ω_z. So a revolute joint rotates about the z axis of L. Of the twelve
 parameters of L and R, those without a gauge freedom remain: a motion that commutes with the subgroup can move
 from L to R, and a motion in the subgroup is a shift of joint values.
+
+Where a joint translates and rotates, the translation of R selects the point of the child that v translates.
+The poses do not depend on this sliding point, but the prior of v does, so it is a parameter.
 """
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -18,17 +22,18 @@ from itertools import product
 from types import MappingProxyType
 from typing import NamedTuple, Self
 
+import casadi as ca
 import numpy as np
 
-from kineverse.compilation import CompiledFunction
-from kineverse.compilation import compile as compiled
+from kineverse import spatial
 from kineverse.errors import InvalidValueError, ShapeError, UnknownNameError
-from kineverse.expressions.expression import Expression
-from kineverse.lie import Array, exp_so3, log_so3, orthonormalize, right_jacobian, skew, transform
+from kineverse.expressions.expression import Expression, array
+from kineverse.expressions.functions import maximum, minimum
+from kineverse.expressions.layout import SX
+from kineverse.lie import Array, log_so3
 from kineverse.symbols import Symbol
 
-from .motion_model import LinearisedPoses, ParameterPrior
-from .native import evaluate_poses, fits_kernel, library
+from .motion_functions import GeneratedMotion, MotionForm, MotionFunctions, ParameterStep, generate
 from .observations import Observations
 
 VX, VY, VZ, WX, WY, WZ = range(6)
@@ -41,9 +46,10 @@ class Parametrisation:
     joints: tuple[int, ...]  # joint values
     left: tuple[int, ...]  # components of the twist that moves L, in the axes of L
     right: tuple[int, ...]  # components of the twist that moves R, applied on its left
+    levers: int = 0  # number of components of the child's position in the joint's frame with a prior
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, eq=False)
 class JointFamily:
     """Joint family."""
 
@@ -51,8 +57,6 @@ class JointFamily:
     poses: Parametrisation  # for observed poses of the child
     positions: Parametrisation  # for observed positions only
     pitch: bool = False  # True if the joint translates along z by a pitch [m/rad] as it rotates
-    reach: int = 0  # number of components of the child's position in the joint's frame that are a lever
-    slides: int = 0  # number of components of the sliding point
 
     def parametrisation(self, rows: int) -> Parametrisation:
         """Return the parametrisation for poses (6 rows) or positions (3 rows)."""
@@ -63,12 +67,12 @@ _P, _V, _VW, _LINE = Parametrisation, (VX, VY, VZ), (VX, VY, VZ, WX, WY, WZ), (V
 _FAMILIES = (
     JointFamily("rigid", _P((), (), _VW), _P((), (), _V)),
     JointFamily("prismatic", _P((VZ,), (WX, WY), (VX, VY, WX, WY, WZ)), _P((VZ,), (WX, WY), (VX, VY))),
-    JointFamily("revolute", _P((WZ,), _LINE, (*_V, WX, WY)), _P((WZ,), _LINE, (VX, VZ)), reach=2),
-    JointFamily("screw", _P((WZ,), _LINE, (*_V, WX, WY)), _P((WZ,), _LINE, (VX, VZ)), pitch=True, reach=2),
-    JointFamily("cylindrical", _P((VZ, WZ), _LINE, (VX, VY, WX, WY)), _P((VZ, WZ), _LINE, (VX,)), reach=2),
-    JointFamily("spherical", _P((WX, WY, WZ), _V, _V), _P((WY, WZ), _V, (VX,)), reach=3),
-    JointFamily("planar", _P((VX, VY, WZ), (WX, WY), (VZ, WX, WY)), _P((VX, VY), (WX, WY), (VZ,)), slides=2),
-    JointFamily("free", _P(_VW, (), ()), _P(_V, (), ()), slides=3),
+    JointFamily("revolute", _P((WZ,), _LINE, (*_V, WX, WY), 2), _P((WZ,), _LINE, (VX, VZ), 2)),
+    JointFamily("screw", _P((WZ,), _LINE, (*_V, WX, WY), 2), _P((WZ,), _LINE, (VX, VZ), 2), pitch=True),
+    JointFamily("cylindrical", _P((VZ, WZ), _LINE, (VX, VY, WX, WY), 2), _P((VZ, WZ), _LINE, (VX,), 2)),
+    JointFamily("spherical", _P((WX, WY, WZ), _V, _V, 3), _P((WY, WZ), _V, (VX,), 3)),
+    JointFamily("planar", _P((VX, VY, WZ), (WX, WY), (*_V, WX, WY), 2), _P((VX, VY), (WX, WY), (VZ,))),
+    JointFamily("free", _P(_VW, (), _V, 3), _P(_V, (), ())),
 )
 JOINT_FAMILIES: Mapping[str, JointFamily] = MappingProxyType({family.name: family for family in _FAMILIES})
 """Families by name. ``rigid`` has no joint values, and ``free`` has no parameters."""
@@ -77,8 +81,73 @@ PITCHES = 0.1  # prior standard deviation of a pitch [m/rad]
 REACH = 1.0  # prior standard deviation of each component of a lever [m]
 
 
-@dataclass(frozen=True, slots=True)
-class GroupMotion:
+@functools.cache
+def group_functions(about_any_axis: bool) -> MotionFunctions:
+    """Return the functions of members of groups, whose joint values rotate about z or about any axis."""
+    state = [Symbol(f"identification/state {i}") for i in range(33)]
+    joints = [Symbol(f"identification/joint {i}") for i in range(6 if about_any_axis else 4)]
+    step = [Symbol(f"identification/step {i}") for i in range(13)]
+
+    def frame(at: int) -> Expression:
+        matrix = array(state[at : at + 16]).reshape(4, 4)
+        return spatial.transform(matrix[:3, :3], matrix[:3, 3])
+
+    def upright(T: Expression) -> Expression:
+        # Rotations drift under repeated multiplication. The error of R (3 - RᵀR) / 2 is the square of R's.
+        R = T[:3, :3]
+        return spatial.transform(R @ (1.5 * np.eye(3) - 0.5 * (R.T @ R)), T[:3, 3])
+
+    def twisted(twist: Sequence[Expression]) -> Expression:
+        return spatial.transform(spatial.exp_so3(array(twist[3:])), array(twist[:3]))
+
+    def nearly(twist: Sequence[Expression]) -> Expression:
+        return spatial.transform(np.eye(3) + spatial.skew(array(twist[3:])), array(twist[:3]))
+
+    def packed(L: Expression, R: Expression) -> SX:
+        return array([*L.ravel(), *R.ravel(), pitch + step[12]]).casadi
+
+    left, right, pitch, angle = frame(0), frame(16), state[32], joints[-1]
+    turn = spatial.exp_so3(array(joints[3:])) if about_any_axis else spatial.rotation_z(angle)
+    shift = array([joints[0], joints[1], joints[2] + pitch * angle])
+    pose = left @ spatial.transform(turn, shift) @ right
+    moved = packed(left @ nearly(step[:6]), nearly(step[6:12]) @ right)
+    after = packed(upright(left @ twisted(step[:6])), upright(twisted(step[6:12]) @ right))
+    prior = array([*(right[:3, 3] / REACH), pitch / PITCHES]).casadi
+    return generate(pose.casadi, state, joints, ParameterStep(step, moved, after), prior=prior)
+
+
+def prepare_functions(wait: bool = False) -> None:
+    """Generate and compile the functions of the joint families, in the background unless ``wait``."""
+    for about_any_axis in (False, True):
+        functions = group_functions(about_any_axis)
+        if wait:
+            functions.wait()
+
+
+@functools.cache
+def _group_form(group: JointFamily, rows: int) -> MotionForm:
+    freedom = group.parametrisation(rows)
+    about_any_axis = bool({WX, WY} & {*freedom.joints})
+    angles = np.array([j >= WX for j in freedom.joints], dtype=bool)
+    free = np.full(len(angles), math.inf)
+    ends, others = len(freedom.left), len(freedom.right) + group.pitch
+    return MotionForm(
+        functions=group_functions(about_any_axis),
+        rows=rows,
+        parameters=(*freedom.left, *(6 + j for j in freedom.right), *([12] if group.pitch else ())),
+        joints=freedom.joints if about_any_axis else tuple(min(j, 3) for j in freedom.joints),
+        beliefs=(*range(freedom.levers), *([3] if group.pitch else ())),
+        kinds=tuple(angles.astype(int).tolist()),
+        # A step turns by at most half a radian, since the poses are linear in the angle only nearby.
+        limits=np.array([np.where(angles, 0.5, math.inf), -free, free]),
+        # 1 rad⁻² has the width and the density of half a sphere.
+        precision=np.array([j in (WX, WY, WZ) for j in freedom.left] + [0] * others + [*angles], dtype=float),
+        movers=tuple(ends + i for i, j in enumerate(freedom.right) if j not in freedom.joints),
+    )
+
+
+@dataclass(frozen=True)
+class GroupMotion(GeneratedMotion):
     """Member of a joint family, parent_T_child = L · g(a) · R."""
 
     group: JointFamily
@@ -92,117 +161,40 @@ class GroupMotion:
         """Components that are joint values or parameters."""
         return self.group.parametrisation(self.rows)
 
-    @property
-    def size(self) -> int:
-        """Number of parameters."""
-        freedom = self.parametrisation
-        return len(freedom.left) + len(freedom.right) + self.group.pitch
+    @cached_property
+    def form(self) -> MotionForm:
+        """Form of the family."""
+        return _group_form(self.group, self.rows)
 
-    @property
-    def joints(self) -> int:
-        """Number of joint values."""
-        return len(self.parametrisation.joints)
+    @cached_property
+    def state(self) -> Array:
+        """Entries of L and R, and the pitch, (33,)."""
+        return np.concatenate([self.left.ravel(), self.right.ravel(), (self.pitch,)])
 
-    @property
-    def slides(self) -> int:
-        """Number of unknown components of the sliding point, see :mod:`.joint_values`."""
-        return self.group.slides if self.rows == 6 else 0
-
-    @property
-    def is_plain(self) -> bool:
-        """True if the motion is no subclass and its family fits the C kernels."""
-        return type(self) is GroupMotion and fits_kernel(self.group, self.rows)
-
-    def linearise(self, values: Array, native: bool = True) -> LinearisedPoses:
-        """Return the poses at joint values (N, k) and their derivatives, in C if possible and ``native``."""
-        if native and library.is_native and self.is_plain:
-            return evaluate_poses(self, values)
-        freedom = self.parametrisation
-        twist = np.zeros((len(values), 6))
-        twist[:, freedom.joints] = values
-        if self.group.pitch:
-            twist[:, VZ] += self.pitch * twist[:, WZ]
-        turn, slide = exp_so3(twist[:, 3:]), twist[:, :3]
-        l_R, r_p = self.left[:3, :3], self.right[:3, 3]
-        parent_R_joint = l_R @ turn
-        lever = parent_R_joint @ r_p
-        arm = slide @ l_R.T + lever
-        parent_T_child = transform(parent_R_joint @ self.right[:3, :3], self.left[:3, 3] + arm)
-        moved = _columns(parent_R_joint, lever)
-        by_left = _columns(np.broadcast_to(l_R, turn.shape), arm)[:, :, freedom.left]
-        by_pitch = np.zeros((len(values), 6, int(self.group.pitch)))
-        by_pitch[:, :3] = (l_R[:, 2] * twist[:, WZ, None])[:, :, None]
-        by_parameters = np.concatenate([by_left, moved[:, :, freedom.right], by_pitch], axis=2)
-        by_joints = moved.copy()
-        # Translations come before the rotation, so they are along the axes of L.
-        by_joints[:, :3, :3], by_joints[:, 3:, :3] = l_R, 0.0
-        if WX in freedom.joints or WY in freedom.joints:
-            by_joints[:, :, 3:] = moved[:, :, 3:] @ right_jacobian(twist[:, 3:])
-        if self.group.pitch:
-            by_joints[:, :3, WZ] += self.pitch * l_R[:, 2]
-        rows = self.rows
-        return LinearisedPoses(parent_T_child, by_parameters[:, :rows], by_joints[:, :rows, freedom.joints])
-
-    def retract(self, step: Array) -> Self:
-        """Return the motion after a step in the parameters."""
-        freedom = self.parametrisation
-        left, right = np.zeros(6), np.zeros(6)
-        ends = len(freedom.left), len(freedom.left) + len(freedom.right)
-        left[list(freedom.left)] = step[: ends[0]]
-        right[list(freedom.right)] = step[ends[0] : ends[1]]
-        l_T_l = transform(exp_so3(left[3:]), left[:3])
-        r_T_r = transform(exp_so3(right[3:]), right[:3])
-        pitch = self.pitch + (float(step[-1]) if self.group.pitch else 0.0)
-        # Rotations drift under repeated multiplication.
-        left_moved, right_moved = orthonormalize(self.left @ l_T_l), orthonormalize(r_T_r @ self.right)
-        return replace(self, left=left_moved, right=right_moved, pitch=pitch)
-
-    def retract_joints(self, values: Array, step: Array) -> Array:
-        """Return joint values after a step of at most half a radian in each angle."""
-        turning = [j >= WX for j in self.parametrisation.joints]
-        step = step.copy()
-        step[:, turning] = np.clip(step[:, turning], -0.5, 0.5)
-        return np.asarray(values + step)
+    def with_state(self, state: Array) -> Self:
+        """Return the member in another state."""
+        left, right = state[:16].reshape(4, 4), state[16:32].reshape(4, 4)
+        moved = type(self)(self.group, self.rows, left, right, float(state[32]))
+        moved.__dict__.update(form=self.form, state=state)
+        return moved
 
     @property
     def name(self) -> str:
         """Name of the family."""
         return self.group.name
 
-    @property
-    def kinds(self) -> tuple[int, ...]:
-        """Kind of each joint value: 0 for translations, 1 for rotations."""
-        return tuple(int(j >= WX) for j in self.parametrisation.joints)
+    def log_density(self) -> float:
+        """Return the log prior density of the parameters beyond a mean pose.
 
-    def log_prior(self, mean: Array) -> tuple[float, Array]:
-        """Return the log prior of the parameters beyond a mean pose, and its precision.
-
-        A lever is Gaussian. A direction is uniform on half the sphere, because an axis has no sign. The mean
-        pose has the improper density 1 / (m³ rad³), which is the same for all families.
+        A lever is Gaussian. A direction is uniform on half the sphere, because an axis has no sign.
         """
-        freedom, reach = self.parametrisation, self.group.reach
-        log = 0.0
-        if WX in freedom.left:
+        lever, log = self.right[: self.parametrisation.levers, 3] / REACH, 0.0
+        if WX in self.parametrisation.left:
             log -= math.log(math.tau)
-        # The lever, and the sliding point.
-        for count in (reach if {VX, VY} <= {*freedom.left} else 0, self.slides):
-            place = self.right[:count, 3] / REACH
-            log -= 0.5 * float(place @ place) + 0.5 * count * math.log(math.tau * REACH**2)
+        log -= 0.5 * float(lever @ lever) + 0.5 * len(lever) * math.log(math.tau * REACH**2)
         if self.group.pitch:
             log -= 0.5 * (self.pitch / PITCHES) ** 2 + 0.5 * math.log(math.tau * PITCHES**2)
-        # Volume of mean poses per unit of the parameters and joint values that move them.
-        linear = self.linearise(mean[None, :])
-        right = slice(len(freedom.left), len(freedom.left) + len(freedom.right))
-        matrix = np.concatenate([linear.by_parameters[0, :, right], linear.by_joints[0]], axis=1)
-        # A lever of length zero has no volume. The bound has the size of an atom [m].
-        log += float(np.sum(np.log(np.maximum(np.linalg.svd(matrix, compute_uv=False), 1e-10))))
-        # A precision of 1 rad⁻² has the width and the density of half a sphere. It keeps unobservable
-        # directions finite, and the mean angle of a rotation without a lever.
-        precision = np.zeros(self.size + self.joints + self.slides)
-        precision[: len(freedom.left)] = [j >= WX for j in freedom.left]
-        precision[self.size : self.size + self.joints] = [j >= WX for j in freedom.joints]
-        precision[self.size + self.joints :] = REACH**-2
-        return log, precision
+        return log
 
     def named_parameters(self) -> dict[str, Array | float]:
         """Return the parameters by name."""
@@ -224,27 +216,6 @@ class GroupMotion:
         left, right = self.parametrisation.left, self.parametrisation.right
         pitch = ["pitch"] if self.group.pitch else []
         return (*(of_left[j] for j in left), *(of_right[j] for j in right), *pitch)
-
-    def prior(self) -> ParameterPrior:
-        """Return the Gaussian prior of levers and pitch."""
-        reach, freedom = self.group.reach, self.parametrisation
-        r_p, start = self.right[:3, 3], len(freedom.left)
-        moves = np.concatenate([np.eye(3), -skew(r_p)], axis=1)[:reach, freedom.right]
-        derivatives = np.zeros((reach + self.group.pitch, self.size))
-        derivatives[:reach, start : start + len(freedom.right)] = moves / REACH
-        residuals = r_p[:reach] / REACH
-        if self.group.pitch:
-            derivatives[-1, -1] = 1.0 / PITCHES
-            residuals = np.append(residuals, self.pitch / PITCHES)
-        return ParameterPrior(residuals, derivatives)
-
-
-def _columns(parent_R_frame: Array, lever: Array) -> Array:
-    """Return twists of the child about its origin, per unit twist of a frame at the end of a lever."""
-    result = np.zeros((len(lever), 6, 6))
-    result[:, :3, :3] = result[:, 3:, 3:] = parent_R_frame
-    result[:, :3, 3:] = -skew(lever) @ parent_R_frame
-    return result
 
 
 # Candidate values of a single joint for each observation, and number of random initial members.
@@ -327,16 +298,50 @@ class Family:
         return self.parameters  # type: ignore[return-value]
 
     @cached_property
-    def function(self) -> CompiledFunction:
-        """Compiled function of joints and parameters: the transform and its derivatives by both."""
-        joints, parameters = list(self.joints), list(self.parameters)
-        outputs = [self.transform]
-        outputs += [self.transform.partial(symbols) for symbols in (parameters, joints) if symbols]
-        return compiled(outputs, [*joints, *parameters])
+    def functions(self) -> MotionFunctions:
+        """Functions of the parameters and a unit of length, and of the joint values."""
+        joints, unknowns, unit = list(self.joints), self.unknowns, Symbol("identification/unit")
+        step = [Symbol(f"identification/step {i}") for i in range(len(unknowns) + 1)]
+        pose = self.transform * array([[1.0, 1.0, 1.0, 1.0 / unit]] * 3 + [[1.0] * 4])
+
+        def derivatives(symbols: Sequence[Symbol]) -> SX:
+            partial = pose.partial(symbols)
+            columns = [ca.vec(partial[:, :, j].casadi) for j in range(len(symbols))]
+            return ca.horzcat(ca.SX.zeros(16, 0), *columns)
+
+        sums = [s + d for s, d in zip((*unknowns, unit), step, strict=True)]
+        bounds = [(u.lower, u.upper) for u in unknowns.values()]
+        after = [minimum(maximum(s, low), high) for s, (low, high) in zip(sums, bounds, strict=False)]
+        off = [(s - u.start) / u.deviation for s, u in unknowns.items()]
+        return generate(
+            pose.casadi,
+            [*unknowns, unit],
+            joints,
+            ParameterStep(
+                step,
+                array(sums).casadi,
+                array([*after, unit]).casadi,
+                ca.horzcat(derivatives([*unknowns]), ca.SX.zeros(16, 1)),
+            ),
+            derivatives(joints),
+            array(off).casadi if off else None,
+        )
+
+    @cached_property
+    def _forms(self) -> Mapping[int, MotionForm]:
+        ranges = np.array([*self.joints.values()]).reshape(-1, 2)
+        count, joints = len(self.unknowns), len(ranges)
+        # A step is at most a quarter of the search range.
+        limits = np.array([0.25 * (ranges[:, 1] - ranges[:, 0]), *ranges.T])
+        form = MotionForm(
+            self.functions, 6, tuple(range(count)), tuple(range(joints)), tuple(range(count)),
+            tuple(range(joints)), limits, np.repeat([0.0, _MEAN_SPREAD**-2], [count, joints]),
+        )  # fmt: skip
+        return {6: form, 3: replace(form, rows=3)}
 
 
 @dataclass(frozen=True, eq=False)
-class FamilyMotion:
+class FamilyMotion(GeneratedMotion):
     """Member of a custom family. Lengths of its poses are in a unit [m], see :mod:`.normalisation`."""
 
     family: Family
@@ -350,60 +355,30 @@ class FamilyMotion:
         return self.family.name
 
     @property
-    def size(self) -> int:
-        """Number of parameters."""
-        return len(self.parameters)
+    def form(self) -> MotionForm:
+        """Form of the family."""
+        return self.family._forms[self.rows]
 
     @property
-    def joints(self) -> int:
-        """Number of joint values."""
-        return len(self.family.joints)
+    def state(self) -> Array:
+        """Parameters, and the unit."""
+        return np.append(self.parameters, self.unit)
 
-    @property
-    def kinds(self) -> tuple[int, ...]:
-        """Kind of each joint value, all different: each has its range."""
-        return tuple(range(self.joints))
+    def with_state(self, state: Array) -> Self:
+        """Return the member in another state."""
+        return replace(self, parameters=state[:-1], unit=float(state[-1]))
 
-    def linearise(self, values: Array) -> LinearisedPoses:
-        """Return the poses at joint values (N, k) and their derivatives."""
-        count, rows = len(values), self.rows
-        inputs = np.concatenate([values, np.tile(self.parameters, (count, 1))], axis=1)
-        poses, *derivatives = (np.array(a) for a in self.family.function.batch(inputs))
-        for lengths in (poses, *derivatives):
-            lengths[:, :3, 3] /= self.unit
-        blocks = iter(derivatives)
-        by_parameters = _twists(poses, next(blocks))[:, :rows] if self.size else np.zeros((count, rows, 0))
-        by_joints = _twists(poses, next(blocks))[:, :rows] if self.joints else np.zeros((count, rows, 0))
-        return LinearisedPoses(poses, by_parameters, by_joints)
-
-    def retract(self, step: Array) -> Self:
-        """Return the member after a step, clipped to the bounds of the parameters."""
-        bounds = np.array([(u.lower, u.upper) for u in self.family.unknowns.values()]).reshape(-1, 2)
-        return replace(self, parameters=np.clip(self.parameters + step, bounds[:, 0], bounds[:, 1]))
-
-    def retract_joints(self, values: Array, step: Array) -> Array:
-        """Return joint values after a step of at most a quarter of the search range, clipped to the range."""
-        ranges = np.array([*self.family.joints.values()]).reshape(-1, 2)
-        largest = 0.25 * (ranges[:, 1] - ranges[:, 0])
-        return np.asarray(np.clip(values + np.clip(step, -largest, largest), ranges[:, 0], ranges[:, 1]))
-
-    def prior(self) -> ParameterPrior:
-        """Return the Gaussian prior of the parameters."""
-        start, deviation = self._prior_moments()
-        return ParameterPrior((self.parameters - start) / deviation, np.diag(1.0 / deviation))
-
-    def log_prior(self, mean: Array) -> tuple[float, Array]:
-        """Return the log prior of the parameters and of the mean joint values, and its precision.
+    def log_density(self) -> float:
+        """Return the log prior density of the parameters and of the mean joint values.
 
         Members of a group also have a mean pose with the density 1. Here the parameters determine the mean
         pose, so the density of a pose within reach is divided out.
         """
-        _, deviation = self._prior_moments()
-        off = self.prior().residuals
+        start, deviation = self._prior_moments()
+        off = (self.parameters - start) / deviation
         log = -0.5 * float(off @ off) - float(np.sum(np.log(math.sqrt(math.tau) * deviation)))
         log += 1.5 * math.log(math.tau * REACH**2) + (math.log(8.0 * math.pi**2) if self.rows == 6 else 0.0)
-        log -= self.joints * math.log(math.sqrt(math.tau) * _MEAN_SPREAD)
-        return log, np.concatenate([np.zeros(self.size), np.full(self.joints, _MEAN_SPREAD**-2)])
+        return log - self.joints * math.log(math.sqrt(math.tau) * _MEAN_SPREAD)
 
     def named_parameters(self) -> dict[str, Array | float]:
         """Return the parameters by name."""
@@ -449,10 +424,3 @@ def _nearest(motion: FamilyMotion, observations: Observations) -> Array:
         ratio = float(np.mean(variances[:, :3])) / float(np.mean(variances[:, 3:]))
         distances = distances + ratio * np.sum(log_so3(turns) ** 2, axis=-1)
     return np.asarray(candidates.reshape(-1, motion.joints)[np.argmin(distances, axis=1)])
-
-
-def _twists(poses: Array, derivatives: Array) -> Array:
-    """Return twists of the child in the parent's axes, (N, 6, n), from derivatives (N, 4, 4, n)."""
-    turning = np.einsum("nijk,nlj->nilk", derivatives[:, :3, :3], poses[:, :3, :3])
-    omega = np.stack([turning[:, 2, 1], turning[:, 0, 2], turning[:, 1, 0]], axis=1)
-    return np.concatenate([derivatives[:, :3, 3], omega], axis=1)

@@ -96,7 +96,7 @@ def identify(
         )
     weight = 1.0 / correlation_time
     data = prepare_data(observations, stated, as_outliers(outliers), sequential, observation_weight=weight)
-    return weigh_and_check(data, solve_joints(data, weights), weights)[0]
+    return weigh_and_check(data, solve_joints(data, weights), weights)
 
 
 def resolve_noise(

@@ -1,12 +1,8 @@
-"""Joint values of a fit: prior of their range, mirrored solutions, sliding point, revolutions.
-
-In parent_T_child = L · translation(v) · Exp(w) · R, the translation c of R selects the point of the child
-that v translates. The likelihood does not depend on c, but the prior of v does. So this sliding point has a
-Gaussian prior around the origin of the child, and the evidence integrates over it.
-"""
+"""Joint values of a fit: prior of their range, point of the child that slides, revolutions."""
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -14,10 +10,10 @@ from typing import NamedTuple
 import numpy as np
 
 from kineverse.estimation.linear_algebra import invert_matrices, multiply_vectors, sum_log_determinants
-from kineverse.lie import Array, exp_so3, inverse, log_so3, skew
+from kineverse.lie import Array, exp_so3, inverse, skew
 
-from .families import REACH, WX, WY, WZ, GroupMotion
-from .least_squares import InitialGuess, JointValuePrior, Solution, levenberg_marquardt
+from .families import REACH, WX, WY, WZ, GroupMotion, JointFamily
+from .least_squares import InitialGuess, Solution
 from .motion_model import FamilyMember, MotionModel
 from .observations import Observations
 
@@ -103,48 +99,32 @@ def _width(values: Array, variances: Array, weight: float) -> tuple[float, float
     return math.exp(best), math.log(float(np.mean(np.exp(logs - logs[top]))))
 
 
-SLIDING_TURNS = 3
-SLIDING_TOLERANCE = 1e-6  # step of the point at convergence [m]
+def has_sliding_point(motion: FamilyMember) -> bool:
+    """Return True if a motion translates a point of the child that is a parameter."""
+    return isinstance(motion, GroupMotion) and bool(_sliding_components(motion))
 
 
-def optimise_sliding_point(solution: Solution[FamilyMember]) -> Solution[FamilyMember]:
-    """Return the same motion with the most likely sliding point."""
-    motion = solution.motion
-    if not isinstance(motion, GroupMotion) or not motion.slides:
-        return solution
-    slides, joints = motion.slides, motion.joints
-    for _ in range(SLIDING_TURNS):
-        per_observation = solve_per_observation(solution)
-        ranges = fit_joint_ranges(solution.motion, per_observation)
-        weights = invert_matrices(per_observation.covariances + np.diag(ranges.deviations**2))
-        # Derivatives of the joint values by their mean and by c.
-        by = np.zeros((len(per_observation.values), joints, joints + slides))
-        by[:, range(joints), range(joints)] = 1.0
-        by[:, :slides, joints:] = _rotations(motion, solution.values)[:, :slides, :slides]
-        weighted = np.swapaxes(by, 1, 2) @ weights
-        normal = (weighted @ by).sum(axis=0)
-        normal[range(joints, joints + slides), range(joints, joints + slides)] += REACH**-2
-        right = multiply_vectors(weighted, per_observation.values).sum(axis=0)
-        right[joints:] -= motion.right[:slides, 3] / REACH**2
-        change = np.linalg.solve(normal, right)[joints:]
-        displacement = np.concatenate([change, np.zeros(3 - slides)])
-        values, moved = solution.values.copy(), motion.right.copy()
-        values[:, :slides] -= (_rotations(motion, values) @ displacement)[:, :slides]
-        moved[:3, 3] += displacement
-        motion = replace(motion, right=moved)
-        solution = replace(solution, motion=motion, values=values, linear=motion.linearise(values))
-        if np.abs(change).max() <= SLIDING_TOLERANCE:
-            break
-    return solution
+def narrow_translations(solution: Solution[FamilyMember], alone: PerObservation) -> Solution[FamilyMember]:
+    """Return the same motion with the sliding point at which the translations are most probable.
 
-
-def sliding_point_twists(motion: FamilyMember, values: Array) -> Array:
-    """Return twists of the child per unit of each component of c, (N, m, 2 or 3), or (N, m, 0)."""
-    if not isinstance(motion, GroupMotion) or not motion.slides:
-        return np.zeros((len(values), motion.rows, 0))
-    result = np.zeros((len(values), 6, motion.slides))
-    result[:, :3] = (motion.left[:3, :3] @ _rotations(motion, values))[:, :, : motion.slides]
-    return result
+    From another point they vary as the rotations do, and the steps to this one are many.
+    """
+    motion, values = solution.motion, solution.values
+    assert isinstance(motion, GroupMotion)
+    slides = len(_sliding_components(motion))
+    rotations = _rotations(motion, values)[:, :slides, :slides]
+    varied = rotations - rotations.mean(axis=0)
+    normal = np.einsum("nij,nik->jk", varied, varied) + 1e-9 * len(values) * np.eye(slides)
+    right = np.einsum("nij,ni->j", varied, alone.values[:, :slides])
+    off = alone.values[:, :slides] - rotations @ np.linalg.solve(normal, right)
+    # The variance of an observation, of the translations or of the noise, against the prior of the point.
+    ridge = max(float(off.var(axis=0).mean()), float(alone.covariances[:, 0, 0].mean())) / REACH**2
+    moved = np.linalg.solve(normal + ridge * np.eye(slides), right - ridge * motion.right[:slides, 3])
+    values, side = values.copy(), motion.right.copy()
+    values[:, :slides] -= rotations @ moved
+    side[:slides, 3] += moved
+    motion = replace(motion, right=side)
+    return replace(solution, motion=motion, values=values, linear=motion.linearise(values))
 
 
 class ChildOriginMotion(NamedTuple):
@@ -160,9 +140,9 @@ def slide_child_origin(
     motion: FamilyMember, covariance: Array, values: Array, covariances: Array
 ) -> ChildOriginMotion:
     """Return a motion with the sliding point at the origin of the child and translations around 0."""
-    if not isinstance(motion, GroupMotion) or not motion.slides:
+    if not isinstance(motion, GroupMotion) or not (sliding := _sliding_components(motion)):
         return ChildOriginMotion(motion, covariance, values, covariances)
-    slides, freedom = motion.slides, motion.parametrisation
+    slides, freedom = len(sliding), motion.parametrisation
     orientation = motion.left[:3, :3].T @ motion.linearise(values).by_joints[:, :3]
     by = np.tile(np.eye(motion.joints), (len(values), 1, 1))
     by[:, :slides, slides:] = orientation[:, :slides, slides:]
@@ -182,9 +162,21 @@ def slide_child_origin(
         for column, other in enumerate((*freedom.left, *freedom.right)):
             if component < WX <= other:
                 moved[ends + row, column] = -skew(middle if column < ends else place)[component, other - WX]
-    motion = replace(motion, left=left, right=right)
+    kept = [j for j in range(motion.size) if j - ends not in sliding]
+    group = _about_child_origin(motion.group)
     covariances = by @ covariances @ np.swapaxes(by, 1, 2)
-    return ChildOriginMotion(motion, moved @ covariance @ moved.T, values, covariances)
+    covariance = (moved @ covariance @ moved.T)[np.ix_(kept, kept)]
+    return ChildOriginMotion(
+        replace(motion, group=group, left=left, right=right), covariance, values, covariances
+    )
+
+
+@functools.cache
+def _about_child_origin(group: JointFamily) -> JointFamily:
+    """Return a family without sliding point."""
+    poses = group.poses
+    kept = tuple(component for component in poses.right if component not in poses.joints)
+    return replace(group, poses=replace(poses, right=kept, levers=0))
 
 
 def _rotations(motion: GroupMotion, values: Array) -> Array:
@@ -193,140 +185,10 @@ def _rotations(motion: GroupMotion, values: Array) -> Array:
     return exp_so3(twist[:, WX:])
 
 
-MIRROR_STEPS, MIRROR_TURNS = 6, 4
-BETTER = 1e-3  # least gain in log density for an exchange
-
-
-class SingleObservation(NamedTuple):
-    """Joint value and parent orientation of each observation by itself, for a fixed motion."""
-
-    values: Array  # most probable joint values, (N, 1)
-    orientation: Array  # most probable orientations of the parent, (N, 3, 3)
-    log_density: Array  # log density of each observation with both integrated out, up to a constant, (N,)
-
-
-def choose_mirrored_values(
-    observations: Observations, solution: Solution[FamilyMember]
-) -> Solution[FamilyMember]:
-    """Choose the more probable of two mirrored joint values for each observation with precise positions."""
-    motion = solution.motion
-    if (
-        not isinstance(motion, GroupMotion)
-        or motion.joints != 1
-        or not (motion.size and observations.softness)
-    ):
-        return solution
-    for _ in range(MIRROR_TURNS):
-        prior, values, parent = solution.joint_prior, solution.values.copy(), solution.parent.copy()
-        current = evaluate_each_observation(observations, motion, values, parent, prior)
-        others = mirrored_values(motion, values, prior)
-        mirrored = evaluate_each_observation(observations, motion, others, parent, prior)
-        is_better = mirrored.log_density > current.log_density + BETTER
-        if not is_better.any():
-            break
-        values[is_better] = mirrored.values[is_better]
-        parent[is_better, :3, :3] = mirrored.orientation[is_better]
-        trial = levenberg_marquardt(observations, motion, values, parent, prior)
-        if trial.cost >= solution.cost:
-            break
-        solution, motion = trial, trial.motion
-    return solution
-
-
-def evaluate_each_observation(
-    observations: Observations,
-    motion: GroupMotion,
-    values: Array,
-    parent: Array,
-    joint_prior: JointValuePrior,
-) -> SingleObservation:
-    """Return the local optimum and the density of each observation near joint values (N, 1).
-
-    The unknowns are the joint value and the parent's orientation. The parent's position is eliminated, so the
-    measured position is the displacement between the two parts.
-    """
-    whitening, log_volume = _whitening(observations)
-    displacement, rows = observations.child[:, :3, 3] - observations.parent[:, :3, 3], observations.rows
-    orientation = _aligned(parent[:, :3, :3], motion.linearise(values).pose[:, :3, 3], displacement)
-    best = SingleObservation(values, orientation, np.full(len(observations), -math.inf))
-    for _ in range(MIRROR_STEPS):
-        linear = motion.linearise(values)
-        lever = multiply_vectors(orientation, linear.pose[:, :3, 3])
-        back = np.swapaxes(orientation, 1, 2)
-        of_parent = log_so3(observations.parent[:, :3, :3] @ back)
-        errors = [displacement - lever, of_parent]
-        by_rotation = [skew(lever), -_inverse_left_jacobian(of_parent)]
-        by_joint = [-orientation @ linear.by_joints[:, :3], np.zeros((len(lever), 3, 1))]
-        if rows == 6:
-            child = observations.child[:, :3, :3] @ np.swapaxes(linear.pose[:, :3, :3], 1, 2)
-            of_child = log_so3(child @ back)
-            inverse_jacobian = _inverse_left_jacobian(of_child)
-            errors.append(of_child)
-            by_rotation.append(-inverse_jacobian)
-            by_joint.append(-inverse_jacobian @ orientation @ linear.by_joints[:, 3:])
-        error = multiply_vectors(whitening, np.concatenate(errors, axis=1))
-        slopes = [np.concatenate(parts, axis=1) for parts in (by_rotation, by_joint)]
-        by = whitening @ np.concatenate(slopes, axis=2)
-        off = values[:, 0] - joint_prior.mean[0]
-        information = np.swapaxes(by, 1, 2) @ by
-        information[:, 3, 3] += joint_prior.precision[0]
-        slope = -np.einsum("nri,nr->ni", by, error)
-        slope[:, 3] -= joint_prior.precision[0] * off
-        log = -0.5 * (np.sum(error**2, axis=1) + joint_prior.precision[0] * off**2) - log_volume
-        log -= 0.5 * np.linalg.slogdet(information)[1] - 0.5 * math.log(joint_prior.precision[0])
-        more = log > best.log_density
-        best = SingleObservation(
-            np.where(more[:, None], values, best.values),
-            np.where(more[:, None, None], orientation, best.orientation),
-            np.where(more, log, best.log_density),
-        )
-        step = multiply_vectors(invert_matrices(information), slope)
-        orientation = exp_so3(step[:, :3]) @ orientation
-        values = motion.retract_joints(values, step[:, 3:])
-    return best
-
-
-def mirrored_values(motion: GroupMotion, values: Array, joint_prior: JointValuePrior) -> Array:
-    """Return the other joint values (N, 1) at which the child has the same distance from the parent."""
-    l_p_parent = -motion.left[:3, :3].T @ motion.left[:3, 3]
-    if motion.parametrisation.joints[0] < WZ:
-        # The foot of the perpendicular from the parent on the child's line along z.
-        return np.asarray(2.0 * (l_p_parent[2] - motion.right[2, 3]) - values)
-    x, y, _ = motion.right[:3, 3]
-    towards = math.atan2(l_p_parent[1], l_p_parent[0]) - math.atan2(y, x)
-    other = 2.0 * towards - values
-    return np.asarray(other - math.tau * np.round((other - joint_prior.mean) / math.tau))
-
-
-def _whitening(observations: Observations) -> tuple[Array, Array]:
-    rows, of_parent = observations.rows, observations.parent_covariance
-    assert of_parent is not None  # only then does the ambiguity arise
-    count, size = len(observations), 3 + rows
-    covariance = np.zeros((count, size, size))
-    covariance[:, :6, :6] = of_parent
-    covariance[:, :3, 3:6] *= -1.0
-    covariance[:, 3:6, :3] *= -1.0
-    covariance[:, :3, :3] += observations.child_covariance[:, :3, :3]
-    if rows == 6:
-        covariance[:, 6:, 6:] = observations.child_covariance[:, 3:, 3:]
-        covariance[:, :3, 6:] = observations.child_covariance[:, :3, 3:]
-        covariance[:, 6:, :3] = observations.child_covariance[:, 3:, :3]
-    lower = np.linalg.cholesky(covariance)
-    return np.linalg.inv(lower), np.log(np.einsum("nii->ni", lower)).sum(axis=1)
-
-
-def _aligned(rotations: Array, lever: Array, displacement: Array) -> Array:
-    """Return rotations, corrected by the smallest one that aligns the levers with the displacement."""
-    pointing = multiply_vectors(rotations, lever)
-    normal = np.cross(pointing, displacement)
-    sine = np.linalg.norm(normal, axis=1)
-    angle = np.arctan2(sine, np.sum(pointing * displacement, axis=1))
-    return np.asarray(exp_so3(normal * (angle / np.where(sine > 0.0, sine, 1.0))[:, None]) @ rotations)
-
-
-def _inverse_left_jacobian(turns: Array) -> Array:
-    """Return the inverse left Jacobian of rotation vectors, to first order."""
-    return np.eye(3) + 0.5 * skew(turns)
+def _sliding_components(motion: GroupMotion) -> tuple[int, ...]:
+    """Return the indices of the sliding point among the components that move R."""
+    freedom = motion.parametrisation
+    return tuple(i for i, component in enumerate(freedom.right) if component in freedom.joints)
 
 
 # A pose determines an angle only up to whole revolutions. In a sequence, the joint is assumed to rotate by

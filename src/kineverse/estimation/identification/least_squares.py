@@ -12,7 +12,6 @@ linearisation is at the estimate. The result maximises the full likelihood with 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Generic, NamedTuple, TypeVar
 
@@ -27,6 +26,7 @@ from kineverse.estimation.linear_algebra import (
 )
 from kineverse.lie import Array, exp_so3, log_so3, skew, transform
 
+from .motion_functions import GeneratedMotion
 from .motion_model import FamilyMember, LinearisedPoses, MotionModel, ParameterPrior
 from .observations import Observations
 
@@ -34,11 +34,9 @@ M = TypeVar("M", bound=MotionModel)
 M_co = TypeVar("M_co", bound=MotionModel, covariant=True)
 
 STEPS = 40
-FIRST_STEPS = 2  # steps of each of several starts, before the best of them continues
 # Predicted decrease of the cost at convergence: a hundredth of a standard deviation. Convergence is linear,
 # so two successive decreases also predict the next one.
 CLOSE = 1e-4
-_DIFFERENCE = 1e-5
 
 
 @dataclass(frozen=True)
@@ -127,19 +125,6 @@ def levenberg_marquardt(
     return Solution(point.motion, point.values, point.cost, *at_end, joint_prior, converged)
 
 
-def solve_from_best_start(
-    observations: Observations, starts: Sequence[InitialGuess]
-) -> Solution[FamilyMember]:
-    """Return the maximum of the likelihood, from the start that is best after a few steps."""
-    if len(starts) == 1:
-        return levenberg_marquardt(observations, *starts[0])
-    begun = [levenberg_marquardt(observations, *start, steps=FIRST_STEPS) for start in starts]
-    best = min(begun, key=lambda solution: solution.cost)
-    if best.converged:
-        return best
-    return levenberg_marquardt(observations, best.motion, best.values, best.parent)
-
-
 def _linearise(
     observations: Observations, motion: M, values: Array, parent: Array, joint_prior: JointValuePrior
 ) -> _Point[M]:
@@ -198,7 +183,7 @@ def _step(
         # The gradient of the prior of joint values, transformed to the parameters.
         pull = multiply_vectors(inverse, pulled)
         right -= np.einsum("nrj,nrk,nk->j", by_parameters, np.swapaxes(weighted, 1, 2), pull)
-        if joint_prior.marginal:
+        if joint_prior.marginal and len(right):
             right -= 0.5 * _log_determinant_gradient(point, inverse @ weighted, joint_prior)
     normal[np.diag_indices_from(normal)] *= 1.0 + damping
     try:
@@ -237,24 +222,23 @@ def _log_determinants(covariance: Array, linear: LinearisedPoses, joint_prior: J
 
 
 def _log_determinant_gradient(point: _Point[M], gains: Array, joint_prior: JointValuePrior) -> Array:
-    """Return the derivatives of Σ log |S + J_a P⁻¹ J_aᵀ| by the parameters, at optimal joint values."""
-    size = point.motion.size
-    result = np.zeros(size)
-    before = _log_determinants(point.covariance, point.linear, joint_prior)
-    of_child = point.covariance - _lever_covariance(point.lever, point.parent_covariance)
-    for i in range(size):
-        step = np.zeros(size)
-        step[i] = _DIFFERENCE
-        values = point.values - _DIFFERENCE * multiply_vectors(gains, point.linear.by_parameters[:, :, i])
-        linear = point.motion.retract(step).linearise(values)
-        lever = _lever(linear.pose[:, :3, 3], point.residuals.shape[1])
-        covariance = of_child + _lever_covariance(lever, point.parent_covariance)
-        result[i] = (_log_determinants(covariance, linear, joint_prior) - before) / _DIFFERENCE
-    return result
+    """Return the derivatives of Σ log |T| by the parameters, T = S + J_a P⁻¹ J_aᵀ, at optimal joint values.
 
-
-def _lever_covariance(lever: Array, covariance: Array | None) -> Array | float:
-    return 0.0 if covariance is None else lever @ covariance @ np.swapaxes(lever, 1, 2)
+    With Π = T⁻¹ and the gains G = P⁻¹ J_aᵀ Π, d log |T| = tr(Π dS) + 2 tr(G dJ_a). S depends on the lever of
+    the parent alone.
+    """
+    by_joints, rows = point.linear.by_joints, point.residuals.shape[1]
+    moved = (by_joints / joint_prior.precision) @ np.swapaxes(by_joints, 1, 2)
+    lever = np.zeros((len(gains), 3))
+    if point.parent_covariance is not None:
+        inverse = invert_matrices(point.covariance + moved)
+        q = (point.parent_covariance @ np.swapaxes(point.lever, 1, 2) @ inverse)[:, 3:, :3]
+        lever = np.stack([q[:, 2, 1] - q[:, 1, 2], q[:, 0, 2] - q[:, 2, 0], q[:, 1, 0] - q[:, 0, 1]], axis=1)
+    assert isinstance(point.motion, GeneratedMotion)  # ranges of other motions are not estimated
+    by_step, by_values = point.motion.slope(point.values, gains[:, :, :rows], lever)
+    # The joint values follow the parameters.
+    followed = np.einsum("nk,nkr,nri->i", by_values, gains, point.linear.by_parameters)
+    return np.asarray(2.0 * (by_step.sum(axis=0) - followed))
 
 
 def _lever(offset: Array, rows: int) -> Array:

@@ -27,9 +27,8 @@ from kineverse.lie import Array
 from .curve import CURVE, FEWEST_POSES, continue_curve, fit_curve, may_be_curve
 from .families import FamilyMotion
 from .least_squares import Solution
-from .marginal_likelihood import Scored, laplace_evidence
+from .marginal_likelihood import laplace_evidence
 from .model_selection import (
-    SAME_RATIO,
     FamilyName,
     FamilySolution,
     FamilySolutions,
@@ -73,9 +72,6 @@ _GAP = 0.3
 # Least probability of χ² of a curve, or its largest size of residuals relative to those of the best family,
 # and least probability of the curve, at which the joint values of that family are said to lie on a curve.
 _FITTING, _FITTING_FACTOR, _COMPETITIVE = 1e-3, 1.3, 1e-6
-# Number of observations up to which joint values are judged by the angles between their steps, and the cosine
-# of the largest median angle of a smooth path. That of independent values is beyond a right angle.
-_FEW, _SMOOTH = 20, math.cos(math.radians(45.0))
 # Probability of slow residuals, and their share in χ², that refute a joint of unknown noise.
 _SYSTEMATIC, _SYSTEMATIC_SHARE = 1e-3, 0.7
 # Sizes of an unknown noise relative to its medians above which it may be motion, for joints with one value
@@ -85,17 +81,13 @@ _ROUNDS = 3  # largest number of classifications of outliers
 
 
 def weigh_and_check(
-    data: IdentificationData,
-    solutions: FamilySolutions,
-    weights: FamilyWeights,
-    before: FamilySolution | None = None,
-) -> tuple[IdentificationResult, FamilySolution | None]:
-    """Return the fits of all families, with the reason if the best is not sure, and the curve if any."""
+    data: IdentificationData, solutions: FamilySolutions, weights: FamilyWeights
+) -> IdentificationResult:
+    """Return the fits of all families, with the reason if the best is not sure."""
     result = weigh_families(data, solutions, weights) if solutions else None
-    curve, is_online = None, before is not None
     is_sure = result is not None and not is_doubtful(data, result, solutions)
     if CURVE in weights and not is_sure:
-        curve = solve_curve(data, solutions, before)
+        curve = solve_curve(data, solutions)
         if curve is not None and not _is_explained(curve, solutions):
             solutions = {**solutions, CURVE: curve}
             result = weigh_families(data, solutions, weights)
@@ -109,22 +101,22 @@ def weigh_and_check(
         name = _best_name(result, solutions)
         solution = solutions[name].scored.solution
         fit = measure_fit(solution, observation_weight=data.observation_weight)
-        compare = partial(_compare_refuted, data, solutions, weights, is_online)
+        compare = partial(_compare_refuted, data, solutions, weights)
         if fit.p_value < REFUTED and fit.factor > CALIBRATED:
             factor = _best_scale(data, solutions, weights, _REFUTED_SCALES)[1]
-            return compare(factor, "none of these joints"), curve
+            return compare(factor, "none of these joints")
         if solution.motion.joints > 1 or name == CURVE:
             other, factor, logs = _best_scale(data, solutions, weights, _DOUBTED_SCALES)
             if other != name and factor > CALIBRATED:
                 if logs[other] - logs[name] > math.log(SURE / (1.0 - SURE)):
-                    return compare(factor, solution.motion.name), curve
+                    return compare(factor, solution.motion.name)
                 family = solutions[other].scored.solution.motion.name
                 reason = f"with {factor:.1f} times the stated noise it would be {family}"
     result = replace(result, reason=reason or next(_reasons(data, result, solutions, weights), ""))
     if CURVE not in result.probabilities and CURVE in weights and may_be_curve(data.observations):
         later = LazyFit(CURVE, 0.0, partial(fit_of_curve, data, solutions, weights))
         result = replace(result, lazy_fits=(*result.lazy_fits, later))
-    return result, curve
+    return result
 
 
 def without_curve(weights: FamilyWeights) -> dict[FamilyName, float]:
@@ -138,9 +130,7 @@ def solve_joints(data: IdentificationData, weights: FamilyWeights) -> FamilySolu
     return solve_with_inliers(data, joints) if joints else {}
 
 
-def solve_curve(
-    data: IdentificationData, solutions: FamilySolutions, before: FamilySolution | None = None
-) -> FamilySolution | None:
+def solve_curve(data: IdentificationData, solutions: FamilySolutions) -> FamilySolution | None:
     """Return the most probable curve by its inliers; None if there are too few for one, or equal."""
     observations, count = data.observations, len(data.observations)
     everything = np.arange(count)
@@ -149,11 +139,6 @@ def solve_curve(
         some = observations if len(rows) == count else observations.select(rows)
         if not may_be_curve(some):
             return None
-        if before is not None and np.array_equal(before.inliers, rows[: len(before.inliers)]):
-            known = before.scored.solution
-            if data.stated:
-                return NoiseSolution(continue_curve(some, known), STATED_NOISE)
-            return adapt_noise(some, NoiseSolution(before.scored, before.noise), continue_curve)
         others = [one.scored.solution for one in solutions.values() if np.array_equal(one.inliers, rows)]
         orders = [other.values[:, 0] for other in others if other.motion.joints == 1]
         return _fit_to_noise(data, some, orders)
@@ -198,17 +183,11 @@ def _fit_to_noise(
         latest = estimated.noise
         return estimated.log_evidence
 
-    def fit(some: Observations) -> Scored:
-        free = solve_families(some, ["free"])["free"].solution
-        return fit_curve(some, free.covariance, orders, log_evidence)
-
+    free = solve_families(observations, ["free"])["free"].solution
+    fitted = fit_curve(observations, free.covariance, orders, log_evidence)
     if data.stated:
-        return NoiseSolution(fit(observations), STATED_NOISE)
-    near = estimate_noise(observations, fit(observations).solution, latest)
-    position, orientation = near.noise.factors.tolist()
-    if not 1.0 / SAME_RATIO < position / orientation < SAME_RATIO:
-        scaled = scale_noise(observations, near.noise.factors)
-        near = estimate_noise(observations, fit(scaled).solution, near.noise)
+        return NoiseSolution(fitted, STATED_NOISE)
+    near = estimate_noise(observations, fitted.solution, latest)
     return adapt_noise(observations, near, continue_curve)
 
 
@@ -225,7 +204,6 @@ def _compare_refuted(
     data: IdentificationData,
     solutions: FamilySolutions,
     weights: FamilyWeights,
-    is_online: bool,
     factor: float,
     otherwise: str,
 ) -> IdentificationResult:
@@ -234,7 +212,7 @@ def _compare_refuted(
     larger = replace(data, observations=scaled, noise_factor=factor)
     again = solve_joints(larger, weights)
     if CURVE in solutions:
-        curve = solve_curve(larger, again, solutions[CURVE] if is_online else None)
+        curve = solve_curve(larger, again)
         if curve is not None:
             again[CURVE] = curve
     result = weigh_families(larger, again, weights)
@@ -263,20 +241,23 @@ def _reasons(
         along = np.sort(solution.values[:, 0])
         if np.diff(along).max() > _GAP * np.ptp(along):
             yield "no pose is in its longest part, so these may be two motions, such as of swapped parts"
-        of_curve = measure_fit(solution, covariance.mean(axis=0))
-        for one in (one.scored.solution for one in solutions.values() if one is not curve):
-            ratio = math.inf
-            if one.motion.joints <= 1:
-                ratio = measure_fit(one, covariance.mean(axis=0)).factor / of_curve.factor
-            if ratio < _CORRELATED:
+        of_curve = measure_fit(solution, covariance.mean(axis=0)).factor
+        for one in solutions.values():
+            joint = one.scored.solution
+            if one is curve or joint.motion.joints > 1:
+                continue
+            ratio = measure_fit(joint, covariance.mean(axis=0)).factor / of_curve
+            if ratio < _CORRELATED or (not data.stated and max(one.noise.factors) < _STRANGE):
                 yield (
-                    f"residuals of {one.motion.name} are only {ratio:.1f} times as large, which correlated "
+                    f"residuals of {joint.motion.name} are only {ratio:.1f} times as large, which correlated "
                     "errors would explain"
+                    if ratio < _CORRELATED
+                    else f"{joint.motion.name} would fit by usual errors: state the noise"
                 )
     elif joints > 1 and curve is not None and not isinstance(solution.motion, FamilyMotion):
         fit = measure_fit(curve.scored.solution, covariance.mean(axis=0), data.observation_weight)
         explains = fit.p_value > _FITTING if data.stated else fit.factor < _FITTING_FACTOR
-        if (explains and result.probabilities[CURVE] > _COMPETITIVE) or _is_smooth(solution.values):
+        if explains and result.probabilities[CURVE] > _COMPETITIVE:
             yield "its joint values lie on one curve"
     elif not data.stated and joints == 1 and curve is not None:
         fit = measure_fit(solution, observation_weight=data.observation_weight)
@@ -318,16 +299,6 @@ def _is_explained(curve: FamilySolution, solutions: FamilySolutions) -> bool:
     return any(measure_fit(one, covariance).factor < 1.0 for one in simple)
 
 
-def _is_smooth(values: Array) -> bool:
-    """Return True if joint values (N, k), too few to fit a curve, run along a smooth one in their order."""
-    if len(values) > _FEW:
-        return False
-    steps = np.diff(values / np.maximum(values.std(axis=0), 1e-12), axis=0)
-    lengths = np.maximum(np.linalg.norm(steps, axis=1), 1e-12)
-    cosines = np.sum(steps[1:] * steps[:-1], axis=1) / (lengths[1:] * lengths[:-1])
-    return bool(np.median(cosines) > _SMOOTH)
-
-
 def _best_scale(
     data: IdentificationData, solutions: FamilySolutions, weights: FamilyWeights, scales: Array
 ) -> tuple[FamilyName, float, dict[FamilyName, float]]:
@@ -359,14 +330,8 @@ def _classify(data: IdentificationData, one: NoiseSolution) -> RowIndices:
     return np.flatnonzero(classify_inliers(*known))
 
 
-def fit_of_curve(
-    data: IdentificationData,
-    solutions: FamilySolutions,
-    weights: FamilyWeights,
-    before: FamilySolution | None = None,
-    probability: float = 0.0,
-) -> Fit:
-    """Return the fit of a curve whose probability is known."""
-    curve = solve_curve(data, solutions, before)
+def fit_of_curve(data: IdentificationData, solutions: FamilySolutions, weights: FamilyWeights) -> Fit:
+    """Return the fit of a curve that is not probable."""
+    curve = solve_curve(data, solutions)
     assert curve is not None  # there are enough observations
-    return replace(weigh_families(data, {CURVE: curve}, weights).best, probability=probability)
+    return replace(weigh_families(data, {CURVE: curve}, weights).best, probability=0.0)

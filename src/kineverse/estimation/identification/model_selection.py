@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import TypeAlias, TypeVar
@@ -175,15 +175,17 @@ def log_principal_widths_gain(solution: Solution[FamilyMember], weight: float = 
     motion = solution.motion
     if not isinstance(motion, GroupMotion) or motion.joints == len(set(motion.kinds)):
         return 0.0
-    known, parts = solver.evidence(solution, weight), []
+    by_joints, parts = solution.linear.by_joints, []
+    precision = np.swapaxes(by_joints, 1, 2) @ invert_matrices(solution.covariance) @ by_joints
+    covariance = invert_matrices(precision + LITTLE * np.eye(motion.joints)).sum(axis=0)
     for kind in sorted(set(motion.kinds)):
         block = np.array(motion.kinds) == kind
         centred = solution.values[:, block] - solution.values[:, block].mean(axis=0)
-        parts.append(np.linalg.eigh(centred.T @ centred))
-        noise = known.joint_covariances[:, block][:, :, block].sum(axis=0)
-        squares, directions = parts[-1]
-        if (squares < _USED**2 * np.einsum("ji,jk,ki->i", directions, noise, directions)).any():
+        squares, directions = np.linalg.eigh(centred.T @ centred)
+        noise = np.einsum("ji,jk,ki->i", directions, covariance[np.ix_(block, block)], directions)
+        if (squares < _USED**2 * noise).any():
             return 0.0
+        parts.append((squares, directions))
     # A common frame has the principal directions of translations, or of rotations if there are no others.
     (squares, directions), turn, log_directions = parts[0], np.eye(3), 0.0
     axes = [joint % 3 for joint in motion.parametrisation.joints[: len(squares)]]
@@ -200,7 +202,7 @@ def log_principal_widths_gain(solution: Solution[FamilyMember], weight: float = 
     turned = _PrincipalMotion(motion.group, motion.rows, motion.left @ change, change.T @ motion.right)
     values = values[:, motion.parametrisation.joints]
     other = replace(solution, motion=turned, values=values, linear=turned.linearise(values))
-    gain = laplace_evidence(other, weight).log_evidence - known.log_evidence
+    gain = laplace_evidence(other, weight).log_evidence - solver.evidence(solution, weight).log_evidence
     return float(np.logaddexp(0.0, gain + log_directions)) - math.log(2.0)
 
 
@@ -214,6 +216,8 @@ class _PrincipalMotion(GroupMotion):
         return tuple(range(self.joints))
 
 
+# Log evidence that a family may lack against one that it contains, by the prior of its further unknowns.
+_FAILED = 5.0
 # Least width of a motion along a principal direction, in standard deviations of its joint values.
 _USED = 2.0
 # A family is not refined if its log evidence is below that of the best by more than a constant and a term for
@@ -276,55 +280,68 @@ def prepare_data(
 
 def solve_with_inliers(data: IdentificationData, weights: FamilyWeights) -> FamilySolutions:
     """Return the solution of each family by its inliers."""
-    inliers = dict.fromkeys(weights, np.arange(len(data.observations)))
-    if data.outliers is not None:
-        inliers = _classify(data, weights, data.observations)
+    everything = np.arange(len(data.observations))
+    inliers = dict.fromkeys(weights, everything)
+    if data.outliers is None or data.stated:
+        solutions = _solve_inliers(data, inliers)
+        if data.outliers is not None:
+            inliers = _classify(
+                data, {name: one.scored for name, one in solutions.items()}, data.observations
+            )
+            fewer = {name: rows for name, rows in inliers.items() if len(rows) < len(everything)}
+            solutions |= _solve_inliers(data, fewer)
+        return score_solutions(data, solutions, inliers, weights)
+    observations = data.observations
+    inliers = _classify(data, solve_families(observations, weights, data.unit), observations)
     solutions = _solve_inliers(data, inliers)
-    if data.outliers is not None and not data.stated:
-        # Where the noise is of another ratio, other observations are outliers.
-        best = max(solutions, key=lambda name: solutions[name].log_evidence + math.log(weights[name]))
-        factors = solutions[best].noise.factors
-        if not 1.0 / SAME_RATIO < factors[0] / factors[1] < SAME_RATIO:
-            inliers = _classify(data, weights, scale_noise(data.observations, factors))
-            solutions = _solve_inliers(data, inliers)
+    # Where the noise is of another ratio, other observations are outliers.
+    best = max(solutions, key=lambda name: solutions[name].log_evidence + math.log(weights[name]))
+    factors = solutions[best].noise.factors
+    if not 1.0 / SAME_RATIO < factors[0] / factors[1] < SAME_RATIO:
+        observations = scale_noise(observations, factors)
+        inliers = _classify(data, solve_families(observations, weights, data.unit), observations)
+        solutions = _solve_inliers(data, inliers)
     return score_solutions(data, solutions, inliers, weights)
 
 
 def _classify(
-    data: IdentificationData, families: Iterable[FamilyName], observations: Observations
+    data: IdentificationData, solutions: Mapping[FamilyName, Scored], observations: Observations
 ) -> dict[FamilyName, RowIndices]:
     assert data.outliers is not None  # else there is nothing to classify
 
     def solve(some: Observations, name: FamilyName) -> Scored:
         return solve_families(some, [name], data.unit)[name]
 
-    solutions = solve_families(observations, families, data.unit)
     return find_inliers(observations, solutions, data.outliers, data.stated, solve)
 
 
 def _solve_inliers(data: IdentificationData, inliers: FamilyInliers) -> dict[FamilyName, NoiseSolution]:
-    def solve(name: FamilyName, statistics: MotionStatistics, some: Observations) -> Scored:
-        # A family is at least as probable by its fit as those that it contains.
-        narrower = [solutions[one].scored.solution for one in CONTAINED.get(name, ()) if one in solutions]
-        wider = [[widened_guess(str(name), one)] for one in narrower if len(one.values) == len(some)]
-        starts = [_starts(some, name, statistics, data.unit), *wider]
-        solved = (solver.maximum_likelihood(some, each) for each in starts)
-        scored = max(solved, key=lambda one: one.log_evidence)
+    def solve(starts: Sequence[InitialGuess], some: Observations) -> Scored:
+        scored = solver.maximum_likelihood(some, starts)
         # A screw is solved again with the revolutions of the observations.
         start = unwrap_screw(some, scored.solution) if data.sequential else None
         return scored if start is None else solver.maximum_likelihood(some, [start])
+
+    def attempt(observations: Observations, starts: Sequence[InitialGuess]) -> NoiseSolution:
+        if data.stated:
+            return NoiseSolution(solve(starts, observations), STATED_NOISE)
+        return solve_unknown_noise(observations, partial(solve, starts))
 
     solver.prepare()
     solutions: dict[FamilyName, NoiseSolution] = {}
     names = sorted(inliers, key=lambda name: name in CONTAINED)  # those that others contain come first
     for rows in {rows.tobytes(): rows for rows in inliers.values()}.values():
-        observations = data.observations.select(rows)
+        observations, solved = data.observations.select(rows), dict[FamilyName, NoiseSolution]()
         statistics = MotionStatistics(observations)
         for name in (name for name in names if np.array_equal(inliers[name], rows)):
-            if data.stated:
-                solutions[name] = NoiseSolution(solve(name, statistics, observations), STATED_NOISE)
-            else:
-                solutions[name] = solve_unknown_noise(observations, partial(solve, name, statistics))
+            found = attempt(observations, _starts(observations, name, statistics, data.unit))
+            # A family that is much less probable than one that it contains was not fitted well.
+            for narrower in (solved[one] for one in CONTAINED.get(name, ()) if one in solved):
+                if found.log_evidence < narrower.log_evidence - _FAILED:
+                    wider = attempt(observations, [widened_guess(str(name), narrower.scored.solution)])
+                    found = max(found, wider, key=lambda each: each.log_evidence)
+            solved[name] = found
+        solutions |= solved
     return {name: solutions[name] for name in inliers}
 
 
@@ -348,7 +365,6 @@ def score_solutions(
     weight, logs, result = data.observation_weight, {}, {}
     for name, one in solutions.items():
         logs[name] = one.log_evidence + math.log(weights[name]) / weight + log_priors[name]
-        logs[name] += log_principal_widths_gain(one.scored.solution, weight) / weight
     threshold = max(logs.values()) - _NEGLIGIBLE / weight
     threshold -= _NEGLIGIBLE_EACH * max(map(len, inliers.values()))
     refine = adapt_noise if renew and not data.stated else _integrate_joint_values
@@ -356,8 +372,8 @@ def score_solutions(
         if logs[name] >= threshold:
             rows = inliers[name]
             one = refine(data.observations if len(rows) == count else data.observations.select(rows), one)
-        log_prior = log_priors[name] + log_principal_widths_gain(one.scored.solution, weight) / weight
-        result[name] = FamilySolution(*one, inliers[name], count, log_prior)
+            log_priors[name] += log_principal_widths_gain(one.scored.solution, weight) / weight
+        result[name] = FamilySolution(*one, inliers[name], count, log_priors[name])
     return result
 
 

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol, Self
+from typing import TYPE_CHECKING, NamedTuple, Protocol, Self
 
 import numpy as np
 
 from kineverse.lie import Array
+
+if TYPE_CHECKING:
+    from .motion_functions import MotionForm
 
 
 class LinearisedPoses(NamedTuple):
@@ -67,8 +70,8 @@ class FamilyMember(MotionModel, Protocol):
     def log_prior(self, mean: Array) -> tuple[float, Array]:
         """Return the log prior of the parameters and of the mean joint values, for the evidence.
 
-        The second result is a precision (n + k + c,) with c sliding components that is added to the one of
-        :meth:`prior`. It keeps directions finite on which there are no data.
+        The second result is a precision (n + k,) that is added to the one of :meth:`prior`. It keeps
+        directions finite on which there are no data.
         """
 
     def named_parameters(self) -> dict[str, Array | float]:
@@ -90,6 +93,22 @@ class FixedMotion:
     def joints(self) -> int:
         """Number of joint values."""
         return self.motion.joints
+
+    @property
+    def form(self) -> MotionForm | None:
+        """Form of the motion if it is generated."""
+        form: MotionForm | None = getattr(self.motion, "form", None)
+        return None if form is None else form.fixed
+
+    @property
+    def state(self) -> Array:
+        """State of the motion, if it is generated."""
+        state: Array = self.motion.state  # type: ignore[attr-defined]
+        return state
+
+    def with_state(self, state: Array) -> Self:
+        """Return itself: the state is fixed."""
+        return self
 
     def linearise(self, values: Array) -> LinearisedPoses:
         """Return the poses at joint values (N, k) and their derivatives."""

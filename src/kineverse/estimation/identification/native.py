@@ -1,148 +1,153 @@
-"""Data structures and functions of the C kernels.
+"""Primitives of identification in C, for motions whose functions are generated and compiled.
 
-The kernels are compiled in the background. Until then, and without a compiler, numpy computes the same.
+The library is compiled in the background, and so are the functions of each motion. Until then, and without a
+compiler, numpy computes the same.
 """
 
 from __future__ import annotations
 
 import ctypes
 import functools
-from dataclasses import replace
+from operator import gt
 from typing import TYPE_CHECKING, Any
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from kineverse.compilation.c_library import SourceLibrary
-from kineverse.errors import ShapeError
-from kineverse.lie import Array, transform
+from kineverse.compilation import CompiledFunction
+from kineverse.compilation import compile as compiled
+from kineverse.compilation.c_library import SourceLibrary, struct_fields
+from kineverse.expressions.expression import array
+from kineverse.lie import Array
+from kineverse.spatial import exp_so3, inverse, log_so3, transform
+from kineverse.symbols import Symbol
 
 from .motion_model import LinearisedPoses
 
 if TYPE_CHECKING:
-    from .families import GroupMotion, JointFamily
+    from .motion_functions import MotionForm
 
 # No other path has to agree with these numbers to the last bit, so contraction is allowed.
 _FLAGS = ("-O3", "-ffp-contract=fast", "-fno-rounding-math", "-lm")
-_FAMILY = ("rows", "joints", "lefts", "rights", "pitches", "pitched", "reach", "slides")
-_SCALES = (
-    "reach_scale", "pitch_scale", "close", "little", "narrowest", "settled", "better", "slid", "weight"
-)  # fmt: skip
-_COUNTS = ("steps", "first_steps", "turns", "sliding_turns", "mirrored_turns", "mirrored_steps", "widths")
-# Largest number of parameters, and of all unknowns, of a family in C.
-_PARAMETERS, _UNKNOWNS = 12, 16
-MOTION_SIZE = 25  # size of the C structure of a motion, in doubles
-
-
-class _Belief(ctypes.Structure):
-    _fields_ = (("mean", ctypes.c_double * 6), ("precision", ctypes.c_double * 6))
+# Largest numbers of parameters, of all unknowns, of a step, a state and a prior's residuals in C.
+_SIZES = {"MOST": 12, "UNKNOWNS": 16, "STEPS": 16, "STATES": 64, "PRIORS": 12}
+_JOINTS = 6
 
 
 class _Noise(ctypes.Structure):
-    _fields_ = (
-        *((name, ctypes.c_void_p) for name in ("covariance", "inverse")),
-        *((name, ctypes.c_int64) for name in ("stride", "round")),
-    )
-
-
-class Given(ctypes.Structure):
-    """C structure of observations."""
-
-    _fields_ = (
-        *((name, ctypes.c_int64) for name in ("count", "known", "fresh", "softer")),
-        *((name, ctypes.c_void_p) for name in ("parent", "child", "parent_covariance", "child_covariance")),
-        ("softness", ctypes.c_void_p),
-    )
+    _fields_ = struct_fields("p covariance inverse; i stride round")
 
 
 class Problem(ctypes.Structure):
-    """C structure of a problem: family, observations, constants and work fields."""
+    """C structure of a motion's form, observations and the prior of the joint values."""
 
     _fields_ = (
-        *((name, ctypes.c_int64) for name in _FAMILY),
-        *((name, ctypes.c_int64 * 6) for name in ("joint", "left", "right", "kind")),
-        ("given", Given),
-        *((name, ctypes.c_double) for name in _SCALES),
-        *((name, ctypes.c_int64) for name in _COUNTS),
-        ("grid", ctypes.c_void_p),
-        *((name, ctypes.c_int64) for name in ("marginal", "mirrored")),
-        ("belief", _Belief),
-        ("of_parent", _Noise),
-        ("of_child", _Noise),
+        *struct_fields("p linearise retract slope prior errors turn_parent"),
+        *struct_fields("i states steps all_joints priors rows size beliefs movers joints"),
+        *((name, ctypes.c_int64 * _SIZES["MOST"]) for name in ("parameter", "belief", "mover")),
+        *((name, ctypes.c_int64 * _JOINTS) for name in ("joint", "kind")),
+        *((name, ctypes.c_double * _JOINTS) for name in ("largest", "lower", "upper")),
+        ("regular", ctypes.c_double * _SIZES["UNKNOWNS"]),
+        *struct_fields("i count; p parent child parent_covariance child_covariance"),
+        *struct_fields("d close little; i widths; p grid; i marginal"),
+        *((name, ctypes.c_double * _JOINTS) for name in ("mean", "precision")),
+        *((name, _Noise) for name in ("of_parent", "of_child")),
     )
 
 
 def _declare(code: Any) -> None:
-    pointer, counter = ctypes.c_void_p, ctypes.c_int64
-    code.at.argtypes = (pointer, counter, *(pointer,) * 5)
-    code.memory_of.argtypes, code.memory_of.restype = (pointer,), counter
-    code.likeliest.argtypes = (pointer, counter, *(pointer,) * 4)
-    code.rate.argtypes = (pointer, counter, *(pointer,) * 8)
-    for stage in (code.solve, code.refine, code.carry_on):
-        stage.argtypes = (pointer,) * 3
-    for function in (code.at, code.likeliest, code.rate, code.solve, code.refine, code.carry_on):
+    pointer, counter, number = ctypes.c_void_p, ctypes.c_int64, ctypes.c_double
+    code.memory_of.argtypes, code.memory_of.restype = (counter,), counter
+    code.evaluate.argtypes = (pointer, counter, *(pointer,) * 5)
+    code.solve.argtypes = (pointer, counter, pointer, pointer)
+    code.rate.argtypes = (pointer, counter, pointer, pointer, number, *(pointer,) * 8)
+    for function in (code.evaluate, code.solve, code.rate):
         function.restype = None
 
 
-library = SourceLibrary("identification.c", _declare, _FLAGS, MOST=_PARAMETERS, UNKNOWNS=_UNKNOWNS)
+library = SourceLibrary("identification.c", _declare, _FLAGS, **_SIZES)
 """Compiled functions, shared by the whole process."""
 
 
 @functools.cache
-def fits_kernel(group: JointFamily, rows: int) -> bool:
-    """Return True if the C structures have room for a family."""
-    freedom = group.parametrisation(rows)
-    left, right, joints = (len(part) for part in (freedom.left, freedom.right, freedom.joints))
+def observation_functions() -> tuple[CompiledFunction[Any], CompiledFunction[Any]]:
+    """Return functions of poses of an observation, each (3, 4): its errors, and the parent's pose after one.
+
+    The errors are those of the measured parent A and child B in the axes of the estimated parent, against it
+    and against the child's pose H in it.
+    """
+
+    def pose(name: str) -> tuple[list[Symbol], Any]:
+        entries = [Symbol(f"identification/{name} {i}") for i in range(12)]
+        top = array(entries).reshape(3, 4)
+        return entries, transform(top[:, :3], top[:, 3])
+
+    (estimated, W), (relative, H), (parent, A), (child, B) = map(pose, ("estimated", "relative", "A", "B"))
+    of_parent, of_child = inverse(W) @ A, inverse(W) @ B
+    turned = transform(of_child[:3, :3] @ H[:3, :3].T, np.zeros(3))
+    errors = [of_parent[:3, 3], log_so3(of_parent), of_child[:3, 3] - H[:3, 3], log_so3(turned)]
+    error = [Symbol(f"identification/error {i}") for i in range(6)]
+    after = W @ transform(exp_so3(array(error[3:])), array(error[:3]))
     return (
-        {*freedom.left, *freedom.right, *freedom.joints} <= {*range(6)}
-        and max(left, right + joints) <= 6
-        and left + right + group.pitch <= _PARAMETERS
-        and left + right + group.pitch + joints + group.slides <= _UNKNOWNS
-        and max(group.reach, group.slides) <= 3
+        compiled(np.concatenate(errors), [*estimated, *relative, *parent, *child]),
+        compiled(after[:3].ravel(), [*estimated, *error]),
     )
 
 
-@functools.cache
-def problem_of(group: JointFamily, rows: int) -> Problem:
-    """Return a problem with the fields of a family only. It is cached, so callers copy it."""
-    freedom, problem = group.parametrisation(rows), Problem()
-    problem.rows, problem.joints = rows, len(freedom.joints)
-    problem.lefts, problem.rights = len(freedom.left), len(freedom.right)
-    problem.pitches = problem.pitched = group.pitch
-    problem.reach, problem.slides = group.reach, group.slides if rows == 6 else 0
-    for name, components in (("joint", freedom.joints), ("left", freedom.left), ("right", freedom.right)):
-        getattr(problem, name)[: len(components)] = components
-    problem.kind[: problem.joints] = [j >= 3 for j in freedom.joints]
-    return problem
+def prepare(wait: bool = False) -> bool:
+    """Compile what all motions share, in the background, and return True if it is there."""
+    ready = library.prepare(wait)
+    for function in observation_functions():
+        if wait:
+            function.wait()
+        ready = ready and function.address is not None
+    return ready
 
 
-def pack_motion(motion: GroupMotion) -> Array:
-    """Return the C structure of a motion: rotation and position of both sides, and the pitch."""
-    result = np.empty(MOTION_SIZE)
-    for at, side in ((0, motion.left), (12, motion.right)):
-        result[at : at + 9].reshape(3, 3)[:] = side[:3, :3]
-        result[at + 9 : at + 12] = side[:3, 3]
-    result[24] = motion.pitch
-    return result
+_problems: WeakKeyDictionary[MotionForm, Problem | None] = WeakKeyDictionary()
 
 
-def unpack_motion(motion: GroupMotion, packed: Array) -> GroupMotion:
-    """Return a motion with the parameters of a C structure."""
-    left, right = (transform(packed[at : at + 9].reshape(3, 3), packed[at + 9 : at + 12]) for at in (0, 12))
-    return replace(motion, left=left, right=right, pitch=float(packed[24]))
+def problem_of(form: MotionForm) -> Problem | None:
+    """Return the structure of a form only, which callers copy; None if it is not compiled or too large."""
+    if not library.is_native:
+        return None
+    if form in _problems:
+        return _problems[form]
+    functions, size, joints = form.functions, len(form.parameters), len(form.joints)
+    sizes = max(size, len(form.beliefs)), size + joints, functions.steps, functions.states, functions.priors
+    if functions.joints > _JOINTS or any(map(gt, sizes, _SIZES.values())):
+        return _problems.setdefault(form, None)
+    result = Problem(
+        states=functions.states, steps=functions.steps, all_joints=functions.joints, priors=functions.priors,
+        rows=form.rows, size=size, joints=joints, beliefs=len(form.beliefs), movers=-1,
+    )  # fmt: skip
+    called = dict(zip(("errors", "turn_parent"), observation_functions(), strict=True))
+    names = ("linearise", "retract", "slope", "prior") if size else ("linearise",)
+    called |= {name: getattr(functions, name) for name in names}
+    for name, function in called.items():
+        if function is not None:
+            if function.address is None:
+                return None
+            setattr(result, name, function.address)
+    result.parameter[:size], result.joint[:joints] = form.parameters, form.joints
+    result.belief[: len(form.beliefs)], result.kind[:joints] = form.beliefs, form.kinds
+    if form.movers is not None:
+        result.movers = len(form.movers)
+        result.mover[: result.movers] = form.movers
+    result.regular[: size + joints] = form.precision.tolist()
+    result.largest[:joints], result.lower[:joints], result.upper[:joints] = form.limits.tolist()
+    return _problems.setdefault(form, result)
 
 
-def evaluate_poses(motion: GroupMotion, values: Array) -> LinearisedPoses:
+def evaluate_poses(problem: Problem, state: Array, values: Array) -> LinearisedPoses:
     """Return the poses at joint values (N, k) and their derivatives, in C."""
     values = np.ascontiguousarray(values, dtype=np.float64)
-    if values.ndim != 2 or values.shape[1] != motion.joints:
-        raise ShapeError(
-            f"The joint values of a {motion.name} motion have shape (N, {motion.joints}), not {values.shape}."
-        )
-    count, rows = len(values), motion.rows
+    count, rows = len(values), problem.rows
     result = LinearisedPoses(
-        np.empty((count, 4, 4)), np.empty((count, rows, motion.size)), np.empty((count, rows, motion.joints))
+        np.empty((count, 4, 4)),
+        np.empty((count, rows, problem.size)),
+        np.empty((count, rows, problem.joints)),
     )
-    arrays = (pack_motion(motion), values, *result)
-    problem = ctypes.addressof(problem_of(motion.group, rows))
-    library.code.at(problem, count, *(array.ctypes.data for array in arrays))
+    arrays = (state, values, *result)
+    library.code.evaluate(ctypes.addressof(problem), count, *(array.ctypes.data for array in arrays))
     return result

@@ -2,9 +2,8 @@
 
 Errors are isotropic, and alike for both parts and all observations. Their two standard deviations are
 independent and log-normal around :data:`UNKNOWN_NOISE`. Each family has its own most probable ones, at which
-its motion is solved. Around them the evidence is integrated over both by Gauss-Hermite quadrature. The motion
-is kept; joint values, their ranges and the Laplace approximation are evaluated at each node. So all families
-have the same prior of the noise, and no family is judged by a noise that suits another.
+its motion is solved. Around them the evidence is integrated over both by Laplace's method, with the motion
+kept. So all families have the same prior of the noise, and no family is judged by a noise that suits another.
 """
 
 from __future__ import annotations
@@ -41,6 +40,7 @@ _STARTS = ((4.0, 0.25), (0.25, 4.0))
 # Least factor, 5 µm and 0.001°. Without it the likelihood of identical poses has no maximum.
 _ROUNDING = 1e-3
 _COARSE = _SPREAD * np.array([-2.0, -1.0, 0.0, 1.0, 2.0])  # logarithms of the factors of the first search
+_FAR = 0.05  # factor on a median below which a motion is solved again
 _BETTER = 0.5  # log density by which another start has to be better
 # Largest number of Newton steps, their largest length, and the step of finite differences, in deviations.
 _STEPS, _LONGEST, _DIFFERENCE = 12, 1.5, 0.5
@@ -48,7 +48,6 @@ _STEPS, _LONGEST, _DIFFERENCE = 12, 1.5, 0.5
 _SOLUTIONS, _SETTLED = 3, 0.3
 # Least and largest curvature over the stencil, relative to that of a Gaussian, at which the step is right.
 _FLAT, _SHARP = 0.3, 3.0
-_NODES, _NODE_WEIGHTS = np.polynomial.hermite_e.hermegauss(7)
 
 
 def median_factor(unit: float) -> float:
@@ -166,15 +165,11 @@ class _NoiseSearch:
                 break
         return _NoiseMode(logs, root, float(self.log_density(logs[None])[0]))
 
-    def integrate(self, mode: _NoiseMode) -> float:
-        """Return the log evidence with the sizes integrated out, by quadrature around the maximum."""
-        nodes = np.array(list(itertools.product(_NODES, repeat=self.dimensions)))
-        weights = np.prod(list(itertools.product(_NODE_WEIGHTS, repeat=self.dimensions)), axis=1)
-        logs = self.log_density(mode.logs + nodes @ mode.root.T)
-        # Far from the maximum the evidence may be beyond floating point.
-        logs = np.where(np.isfinite(logs), logs, -np.inf)
-        logs += np.log(weights) + 0.5 * np.sum(nodes**2, axis=1)
-        return float(np.logaddexp.reduce(logs)) + _log_volume(mode.root)
+    def log_weight(self, mode: _NoiseMode) -> float:
+        """Return the log ratio of the evidence with the sizes integrated out to that at the maximum."""
+        log = float(self.log_evidences(mode.logs[None])[0])
+        _, volume = np.linalg.slogdet(mode.root)
+        return mode.log_density - log + 0.5 * len(mode.logs) * math.log(math.tau) + float(volume)
 
 
 def estimate_noise(
@@ -196,16 +191,20 @@ def solve_unknown_noise(observations: Observations, solve: Callable[[Observation
         other = _NoiseSearch(observations, solution)
         if other.log_density(mode.logs[None])[0] > mode.log_density + _BETTER:
             search, mode = other, other.maximise(mode.logs, mode.root)
+    factors = _factors(mode.logs[None])[0]
+    if factors.min() < _FAR:
+        # At so much larger a noise, the priors of levers have moved the motion.
+        search = _NoiseSearch(observations, solve(scale_noise(observations, factors)).solution)
+        mode = search.maximise(mode.logs, mode.root)
     return _at_mode(search, mode)
 
 
 def _at_mode(search: _NoiseSearch, mode: _NoiseMode) -> NoiseSolution:
     """Return the solution of a search at its maximum, and Laplace's approximation around it."""
-    log = float(search.log_evidences(mode.logs[None])[0])
-    weight = mode.log_density - log + 0.5 * len(mode.logs) * math.log(math.tau) + _log_volume(mode.root)
     covariance = np.tensordot(_factors(mode.logs[None])[0] ** 2, search.parts, axes=1)
+    log = float(search.log_evidences(mode.logs[None])[0])
     scored = Scored(replace(search.solution, covariance=covariance), log)
-    return NoiseSolution(scored, NoisePosterior(mode.logs, mode.root, weight))
+    return NoiseSolution(scored, NoisePosterior(mode.logs, mode.root, search.log_weight(mode)))
 
 
 def adapt_noise(
@@ -232,8 +231,9 @@ def adapt_noise(
         logs, root = mode.logs, mode.root
         if float(np.linalg.norm(np.linalg.solve(root, logs - used))) < _SETTLED:
             break
-    weight = search.integrate(mode) - float(search.log_evidences(used[None])[0])
-    return NoiseSolution(scored, NoisePosterior(used, root, weight))
+    # The solution is that at the sizes used, and the evidence that at the maximum.
+    off = float(search.log_evidences(mode.logs[None])[0]) - float(search.log_evidences(used[None])[0])
+    return NoiseSolution(scored, NoisePosterior(used, root, search.log_weight(mode) + off))
 
 
 def weigh_observations(observations: Observations, one: NoiseSolution, weight: float) -> NoiseSolution:
@@ -247,8 +247,7 @@ def weigh_observations(observations: Observations, one: NoiseSolution, weight: f
     missing = reached - float(_NoiseSearch(observations, solution).log_evidences(noise.logs[None])[0])
     mode = search.maximise(noise.logs, noise.root / math.sqrt(weight))
     (solution, predicted), noise = _at_mode(search, mode)
-    scored = Scored(solution, predicted + weight * missing)
-    return NoiseSolution(scored, noise._replace(log_weight=search.integrate(mode) - predicted))
+    return NoiseSolution(Scored(solution, predicted + weight * missing), noise)
 
 
 def _factors(logs: Array) -> Array:
@@ -256,10 +255,6 @@ def _factors(logs: Array) -> Array:
     factors = np.ones((len(logs), 2))
     factors[:, : logs.shape[1]] = np.hypot(np.exp(logs), _ROUNDING)
     return factors
-
-
-def _log_volume(root: Array) -> float:
-    return float(np.linalg.slogdet(root)[1])
 
 
 def _covariance_parts(observations: Observations, solution: Solution[FamilyMember]) -> Array:

@@ -121,7 +121,6 @@ class Identifier:
         self._added: list[Observations] = []  # the first entry may be many
         self._count = 0
         self._solutions: FamilySolutions = {}
-        self._curve: FamilySolution | None = None
         self._result: IdentificationResult | None = None
         self._full_count, self._noise_count, self._unit = 0, 0, 1.0
 
@@ -188,19 +187,19 @@ class Identifier:
 
     @singularity_named()
     def _identify(self, observations: Observations) -> IdentificationResult:
-        count, curve = len(observations), self._curve
+        count = len(observations)
         # A few observations do not determine which of them are outliers.
         if count >= (2.0 if self._outliers is None else 1.0 + _MORE) * self._full_count:
             self._full_count = self._noise_count = count
             data = prepare_data(observations, self._stated, self._outliers, self._sequential)
-            self._unit, curve = data.unit, None
+            self._unit = data.unit
             known = solve_joints(data, self._weights)
         else:
             data = prepare_data(observations, self._stated, self._outliers, self._sequential, self._unit)
             renew = count >= (1.0 + _MORE) * self._noise_count
             self._noise_count = count if renew else self._noise_count
             known = warm_start(data, self._solutions, self._weights, renew)
-        result, self._curve = weigh_and_check(data, known, self._weights, curve)
+        result = weigh_and_check(data, known, self._weights)
         likely = {name for name, p in result.probabilities.items() if p > _NEGLIGIBLE} - {CURVE}
         kept = {name: one for name, one in known.items() if one.scored.solution.motion.name in likely}
         self._solutions = kept or known

@@ -79,7 +79,9 @@ def find_inliers(
     search = _InlierSearch(observations, outliers, stated)
     hypotheses = {name: search.hypothesis(one.solution) for name, one in solutions.items()}
     unsettled = [name for name, hypothesis in hypotheses.items() if not search.is_settled(hypothesis)]
-    if not unsettled:
+    simple = (name for name, one in solutions.items() if one.solution.motion.joints == 1)
+    # Where one path explains all observations, no family gains by leaving some out.
+    if not unsettled or not all(name in unsettled for name in simple):
         return dict.fromkeys(solutions, everything)
     for name in unsettled:
         hypotheses[name] = search.anneal(hypotheses[name])

@@ -10,7 +10,7 @@ have the same unit.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 
@@ -90,16 +90,15 @@ def log_evidence(served: KnownJoint, residuals: KnownResiduals, is_static: bool 
     return log + (_log_evidence_of_several(served, residuals, widths) if served.joints else 0.0)
 
 
-def log_displacement_gain(residuals: KnownResiduals) -> float:
-    """Return the log density ratio of ρ = G δ + noise, δ ~ N(0, s² I) for several s, to noise alone."""
+def log_displacement_gain(residuals: KnownResiduals, covariances: Iterable[Array]) -> float:
+    """Return the log density ratio of ρ = G δ + noise to noise alone, on average over N(0, Σ) of δ."""
     transposed = np.swapaxes(residuals.displacement_jacobian, 1, 2)
     information = np.sum(transposed @ residuals.displacement_jacobian, axis=0)
     pull = np.sum(transposed @ residuals.orthogonal[:, :, None], axis=0)[:, 0]
     logs = []
-    for size in SIZES:
-        total = information + np.eye(len(pull)) / size**2
-        log_volume = np.linalg.slogdet(size**2 * total)[1]
-        logs.append(0.5 * (pull @ np.linalg.solve(total, pull) - log_volume))
+    for covariance in covariances:
+        total = np.eye(len(pull)) + covariance @ information
+        logs.append(0.5 * (pull @ np.linalg.solve(total, covariance @ pull) - np.linalg.slogdet(total)[1]))
     return _log_mean(np.array(logs))
 
 
@@ -177,6 +176,7 @@ class JointObservations(TimedResiduals):
     served: KnownJoint  # motion in the served model
     observations: Observations  # of both frames
     stamps: Array  # their times [s], (N,)
+    displacement: Array | None = None  # covariance (12, 12) of a joint that is not known exactly
 
     def select(self, rows: slice | npt.NDArray[np.int_]) -> JointObservations:
         """Return some of the observations."""
@@ -259,14 +259,16 @@ def displacement_covariance(fit: Fit, middle: Array) -> Array:
 
 def _probabilities(data: JointObservations, alternative: IdentificationResult | None) -> dict[str, float]:
     served, residuals = data.served, data.residuals
-    as_served = log_evidence(served, residuals)
+    known = np.zeros((12, 12)) if data.displacement is None else data.displacement
+    exact, gain = log_evidence(served, residuals), log_displacement_gain(residuals, [known])
+    elsewhere = log_displacement_gain(residuals, [known + size**2 * np.eye(12) for size in SIZES])
     logs = {
-        "served": math.log(PRIOR["served"]) + as_served,
-        "elsewhere": math.log(PRIOR["elsewhere"]) + as_served + log_displacement_gain(residuals),
+        "served": math.log(PRIOR["served"]) + exact + gain,
+        "elsewhere": math.log(PRIOR["elsewhere"]) + exact + elsewhere,
         "rigid": -math.inf,
     }
     if served.joints:
-        logs["rigid"] = math.log(PRIOR["rigid"]) + log_evidence(served, residuals, is_static=True)
+        logs["rigid"] = math.log(PRIOR["rigid"]) + log_evidence(served, residuals, is_static=True) + gain
     # A family's probability is its evidence times its prior, up to a common factor.
     for fit in alternative or ():
         if fit.probability > 0.0 and alternative is not None:

@@ -37,6 +37,7 @@ from .e_process import CorrelatedTest, SequentialTest
 from .report import JointVerdict, Plausibility, TestableJoint, find_testable_joints
 from .residuals import KnownJoint, compute_residuals
 
+_OBSERVED, _EYE_3 = np.ones(1, dtype=bool), np.eye(3)
 FALSE_ALARMS = 1e-3  # default probability of rejecting a joint that is as served
 
 
@@ -163,7 +164,7 @@ class _TestedModel:
         settings: _TestSettings,
         repaired: Iterable[JointVerdict] = (),
     ) -> None:
-        self.model, self.settings, self._repaired = model, settings, tuple(repaired)
+        self.model, self.settings = model, settings
         self.testable = find_testable_joints(model, frames, settings.relative_to)
         self.served: dict[TestableJoint, KnownJoint] = {}
         self._reasons: dict[TestableJoint, str] = {}
@@ -173,6 +174,15 @@ class _TestedModel:
             except KineverseError as error:
                 self._reasons[joint] = f"its pose cannot be computed. {error}"
         self.consistency = ConsistencyTests(model, self.served, settings.relative_to)
+        # Covariances of the displacements of joints that are replacements.
+        self._known: dict[TestableJoint, Array] = {}
+        for verdict in repaired:
+            for joint in self.served:
+                same = (verdict.tag, verdict.joint.child) == (joint.tag, joint.child)
+                if same and verdict.joint.parent == joint.parent and verdict.result is not None:
+                    if verdict.replacement == model.history.operation(joint.tag):
+                        fit, middle = verdict.result.best, self.served[joint].middle
+                        self._known[joint] = displacement_covariance(fit, middle)
 
     def is_equal(self, joint: TestableJoint, other: _TestedModel) -> bool:
         """Return True if a joint is the same in another version."""
@@ -206,26 +216,25 @@ class _TestedModel:
             except KineverseError as error:
                 self._reasons[joint] = f"its pose cannot be computed. {error}"
                 continue
-            data[joint] = JointObservations(rows + first, residuals, joint, served, poses, stamps[rows])
+            known = self._known.get(joint)
+            data[joint] = JointObservations(
+                rows + first, residuals, joint, served, poses, stamps[rows], known
+            )
         tested = self.consistency.apply(data)
-        return {joint: replace(each, residuals=tested[joint]) for joint, each in data.items()}
+        for joint, each in data.items():
+            if tested[joint] is not each.residuals:
+                data[joint] = replace(each, residuals=tested[joint])
+        return data
 
-    def begin_test(self, joint: TestableJoint) -> SequentialTest:
-        """Return a new test of a joint. A replacement is known with the covariance of its fit."""
-        displacement, served = None, self.model.history.operation(joint.tag)
-        for verdict in self._repaired:
-            pair = verdict.joint.parent, verdict.joint.child
-            if verdict.result is not None and pair == (joint.parent, joint.child):
-                if verdict.replacement is not None and verdict.replacement == served:
-                    displacement = displacement_covariance(verdict.result.best, self.served[joint].middle)
-        outliers = self.settings.pair_outliers(joint)
-        return SequentialTest(
-            self.settings.false_alarms, outliers.fraction if outliers else 0.0, displacement
-        )
+    def begin_test(self, data: JointObservations) -> SequentialTest:
+        """Return a new test of a joint."""
+        outliers = self.settings.pair_outliers(data.joint)
+        fraction = outliers.fraction if outliers else 0.0
+        return SequentialTest(self.settings.false_alarms, fraction, data.displacement)
 
     def test(self, data: JointObservations) -> int | None:
         """Return the first observation that a joint does not explain; None if it explains all."""
-        residuals, test = data.residuals, self.begin_test(data.joint)
+        residuals, test = data.residuals, self.begin_test(data)
         size = residuals.orthogonal.shape[1]
         looks = self.settings.correlation.measure(residuals.whitened, size, data.stamps)
         for row in zip(
@@ -343,6 +352,7 @@ class PlausibilityMonitor:
             false_alarms, as_outliers(outliers), relative_to, families, decorrelation_time
         )
         self._noise = noise
+        self._covariances: Array | None = None  # checked covariance of a pose without its own, (1, 6, 6)
         self._last: float | None = None
         self._recent: deque[dict[str, PoseTrack]] = deque(maxlen=keep)
         self._stamps: deque[float] = deque(maxlen=keep)
@@ -398,7 +408,7 @@ class PlausibilityMonitor:
         self._last = time
         for joint, data in self._tested.observe(tracks, np.array([time]), self.count).items():
             if joint not in self._monitored:
-                test = CorrelatedTest(self._tested.begin_test(joint), self._settings.correlation)
+                test = CorrelatedTest(self._tested.begin_test(data), self._settings.correlation)
                 self._monitored[joint] = _MonitoredJoint(test, self.count)
             self._monitored[joint].test.add(data.residuals, self.count, time)
         self._recent.append(tracks)
@@ -438,8 +448,14 @@ class PlausibilityMonitor:
         matrix = as_numbers(pose, f"The pose of '{name}'")
         if matrix.shape != (4, 4):
             raise ShapeError(f"The pose of '{name}' is a 4×4 transform, not of shape {matrix.shape}.")
-        track: PosesLike = (matrix[None], covariance[0]) if covariance else matrix[None]
-        return check_tracks({name: track}, self._noise)[name]
+        if not covariance and self._covariances is not None and _is_certainly_rigid(matrix):
+            # The usual case in a fraction of the time.
+            return PoseTrack(matrix[None].copy(), self._covariances, _OBSERVED)
+        given: PosesLike = (matrix[None], covariance[0]) if covariance else matrix[None]
+        track = check_tracks({name: given}, self._noise)[name]
+        if not covariance:
+            self._covariances = track.covariances
+        return track
 
     def _next_time(self, at: float | None) -> float:
         if self._last is None:
@@ -448,3 +464,14 @@ class PlausibilityMonitor:
             first = "had one" if self._settings.stamped else "had none"
             raise InvalidValueError(f"Either all observations have a time (at=), or none: the first {first}.")
         return self._last + 1.0 if at is None else _check_time(at, self._last)
+
+
+def _is_certainly_rigid(pose: Array) -> bool:
+    """Return True for a pose (4, 4) that needs no further check."""
+    rotation = pose[:3, :3]
+    return (
+        bool(np.abs(rotation.T @ rotation - _EYE_3).max() < 1e-6)
+        and float(np.linalg.det(rotation)) > 0.0
+        and pose[3].tolist() == [0.0, 0.0, 0.0, 1.0]
+        and bool(np.abs(pose[:3, 3]).max() < 1e6)
+    )

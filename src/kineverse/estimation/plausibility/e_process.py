@@ -152,8 +152,8 @@ class _CensoredBet:
         self.robust = outlier_fraction > 0.0
         self._least, self._most = outlier_fraction, min(_MOST * outlier_fraction, 1.0)
         self._seen, self._outliers = _AT_FIRST, _AT_FIRST * self._most
-        self._limits = _CUTS if self.robust else np.array([np.inf])
-        self._cuts = np.log(self._limits)
+        self._set_price()
+        self._cuts = np.log(_CUTS) if self.robust else np.array([np.inf])
         stakes = _STAKES if self.robust else np.ones(1)
         with np.errstate(divide="ignore"):
             self._kept, self._staked = np.log1p(-stakes), np.log(stakes)
@@ -164,13 +164,15 @@ class _CensoredBet:
         """Count an observation, and forget old ones."""
         kept = 1.0 - 1.0 / _MEMORY
         self._seen, self._outliers = kept * self._seen + 1.0, kept * self._outliers + is_outlier
+        self._set_price()
+
+    def _set_price(self) -> None:
+        share = min(max(self._outliers / self._seen, self._least), self._most)
+        self._price = np.log1p(share * (_CUTS - 1.0)) if self.robust else np.zeros(1)
 
     def gains(self, log: Array) -> Array:
         """Return the log gain for each cut, (..., cuts), of log density ratios."""
-        if not self.robust:
-            return log[..., None]
-        share = min(max(self._outliers / self._seen, self._least), self._most)
-        return np.asarray(np.minimum(log[..., None], self._cuts) - np.log1p(share * (self._limits - 1.0)))
+        return np.asarray(np.minimum(log[..., None], self._cuts) - self._price)
 
     def stake(self, log: Array) -> Array:
         """Return the log gain for each stake and cut, (..., stakes, cuts)."""
@@ -211,11 +213,14 @@ class _DisplacementTest:
         self._logs = np.full((_CHANGE_POINTS, len(SIZES), bet.cuts), -np.inf)
         self._prior = np.square(SIZES)[:, None, None] * np.eye(12)
         self._means = np.zeros((1 + _CHANGE_POINTS * len(SIZES), 12))
+        self._is_exact = served is None
         none = np.zeros((1, 12, 12)) if served is None else served[None]
         self._covariances = np.concatenate([none, np.tile(self._prior, (_CHANGE_POINTS, 1, 1))])
 
     def served_square(self, orthogonal: Array, displacement_jacobian: Array) -> float:
         """Return the squared Mahalanobis norm of a residual under the served joint."""
+        if self._is_exact:
+            return float(orthogonal @ orthogonal)
         error = orthogonal - displacement_jacobian @ self._means[0]
         spread = displacement_jacobian @ self._covariances[0] @ displacement_jacobian.T
         return float(error @ np.linalg.solve(spread + np.eye(len(error)), error))

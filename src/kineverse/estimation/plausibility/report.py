@@ -37,79 +37,60 @@ class TestableJoints:
 
 def find_testable_joints(model: Model, observed: Iterable[str], relative_to: str | None) -> TestableJoints:
     """Find the joints that observed frames can test."""
-    frames = list(dict.fromkeys(observed))
-    for name in frames if relative_to is None else [*frames, relative_to]:
+    names = list(dict.fromkeys(observed))
+    for name in names if relative_to is None else [*names, relative_to]:
         if name != WORLD and name not in model.frames:
             hint = suggest(name, [*model.frames, WORLD], "frame")
             raise UnknownNameError(f"There is no frame {name!r}. {hint}")
-    return _Finder(model, [f for f in frames if f != relative_to], relative_to).find()
 
+    def chain(name: str) -> list[str]:
+        return [*ancestors(name, model.frames.__getitem__), WORLD]
 
-class _Finder:
-    """Search for testable pairs of observed frames."""
-
-    def __init__(self, model: Model, frames: list[str], exact: str | None) -> None:
-        self.model, self.exact, last = model, exact, [] if exact is None else [exact]
-        self.chains = {f: self._chain(f) for f in (*frames, *last)}
-        self.frames = sorted(frames, key=lambda f: len(self.chains[f]))
-        # Observed frames of each part. The observer's frame comes last, because others are preferred.
-        self.parts: dict[str, list[str]] = {}
-        for name in (*self.frames, *last):
-            self.parts.setdefault(self._root(name), []).append(name)
-
-    def find(self) -> TestableJoints:
-        joints: list[TestableJoint] = []
-        untested: dict[str, str] = {}
-        for name in self.frames:
-            result = self._find_rigid_pair(name) or self._find_moving_pair(name)
-            if isinstance(result, TestableJoint):
-                joints.append(result)
-            elif result:
-                untested[name] = result
-        return TestableJoints(tuple(joints), untested)
-
-    def _find_rigid_pair(self, name: str) -> TestableJoint | None:
-        """Return the pair with the first observed frame of the same part; None for that frame itself."""
-        part = self.parts[self._root(name)]
-        first = self.exact if self.exact in part else part[0]
-        if first is None or first == name or name == WORLD:
-            return None
-        nearest = next((f for f in self.chains[name][1:] if f in part), first)
-        return TestableJoint(self._writer(name), nearest, name, self.model.frames[name].parent, name, False)
-
-    def _find_moving_pair(self, name: str) -> TestableJoint | str:
-        frame = top = self._root(name)
-        tags: list[str] = []
-        while top != WORLD:
-            if (tag := self._writer(top)) not in tags:
-                tags.append(tag)
-            base = self.model.frames[top].parent
-            top = self._root(base)
-            if top in self.parts:
-                break
-        else:
-            return "no frame with which it could be compared is observed"
-        part = self.parts[top]
-        parent = next((f for f in self._chain(base) if f in part), part[0])
-        if len(tags) > 1:
-            between = ", ".join(f"'{tag}'" for tag in tags)
-            return f"several operations are between it and '{parent}': {between}; observe a frame in between"
-        return TestableJoint(tags[0], parent, name, base, frame, True)
-
-    def _writer(self, frame: str) -> str:
-        return self.model.history.writers(f"frames/{frame}")[-1]
-
-    def _root(self, name: str) -> str:
-        while name != WORLD and not self._moves(name):
-            name = self.model.frames[name].parent
-        return name
-
-    def _moves(self, name: str) -> bool:
-        expressions = [f for f in self.model.frames[name].factors if isinstance(f, Expression)]
+    def moves(name: str) -> bool:
+        expressions = [f for f in model.frames[name].factors if isinstance(f, Expression)]
         return any(symbol.has_derivative for factor in expressions for symbol in factor.symbols)
 
-    def _chain(self, name: str) -> list[str]:
-        return [*ancestors(name, self.model.frames.__getitem__), WORLD]
+    def root(name: str) -> str:
+        return next(f for f in chain(name) if f == WORLD or moves(f))
+
+    def writer(frame: str) -> str:
+        return model.history.writers(f"frames/{frame}")[-1]
+
+    names = sorted((f for f in names if f != relative_to), key=lambda f: len(chain(f)))
+    # Observed frames of each part. The observer's frame comes last, because others are preferred.
+    parts: dict[str, list[str]] = {}
+    for name in (*names, *(() if relative_to is None else (relative_to,))):
+        parts.setdefault(root(name), []).append(name)
+    joints: list[TestableJoint] = []
+    untested: dict[str, str] = {}
+    for name in names:
+        frame = top = root(name)
+        part = parts[top]
+        first = relative_to if relative_to in part else part[0]
+        if first is not None and first != name and name != WORLD:
+            # It is fixed to the nearest observed frame of its part.
+            nearest = next((f for f in chain(name)[1:] if f in part), first)
+            joints.append(TestableJoint(writer(name), nearest, name, model.frames[name].parent, name, False))
+            continue
+        tags: list[str] = []
+        base = top
+        while top != WORLD and (not tags or top not in parts):
+            if (tag := writer(top)) not in tags:
+                tags.append(tag)
+            base = model.frames[top].parent
+            top = root(base)
+        if not tags or top not in parts:
+            untested[name] = "no frame with which it could be compared is observed"
+            continue
+        parent = next((f for f in chain(base) if f in parts[top]), parts[top][0])
+        if len(tags) > 1:
+            between = ", ".join(f"'{tag}'" for tag in tags)
+            untested[name] = (
+                f"several operations are between it and '{parent}': {between}; observe a frame in between"
+            )
+        else:
+            joints.append(TestableJoint(tags[0], parent, name, base, frame, True))
+    return TestableJoints(tuple(joints), untested)
 
 
 class ImplausibleError(ModelError):
@@ -118,42 +99,19 @@ class ImplausibleError(ModelError):
 
 @dataclass(frozen=True)
 class JointVerdict:
-    """Verdict on one joint.
-
-    Attributes
-    ----------
-    joint
-        The tested joint: its operation and frames.
-    probabilities
-        Probabilities of the joint as ``served``, of the same displaced (``elsewhere``), of a ``rigid``
-        connection, of a ``free`` child, and of other families. They use the observations from
-        ``implausible_since`` on, or all.
-    rms
-        Root mean square of the residuals of positions [m] and orientations [rad] with the best joint values,
-        over the same observations.
-    count
-        Number of observations of both frames.
-    implausible_since
-        First observation that the joint does not explain; None if it explains all.
-    result
-        Identification result of the alternatives; None if there are too few observations.
-    replacement
-        Operation to replace the served one, if the joint is rejected and an alternative fits.
-    reason
-        Reason for a missing verdict or replacement; empty otherwise.
-    outliers
-        Numbers of the outliers, which are left out of all of this.
-    """
+    """Verdict on one joint."""
 
     joint: TestableJoint
+    # Of the joint as "served", the same displaced ("elsewhere"), a "rigid" connection, a "free" child, and
+    # other families, by the observations from implausible_since on, or all.
     probabilities: Mapping[str, float]
-    rms: tuple[float, float]
-    count: int
-    implausible_since: int | None = None
-    result: IdentificationResult | None = None
-    replacement: Operation | None = None
-    reason: str = ""
-    outliers: tuple[int, ...] = ()
+    rms: tuple[float, float]  # residuals of positions [m] and orientations [rad] over the same observations
+    count: int  # number of observations of both frames
+    implausible_since: int | None = None  # first observation that the joint does not explain
+    result: IdentificationResult | None = None  # of the alternatives; None if there are too few observations
+    replacement: Operation | None = None  # if the joint is rejected and an alternative fits
+    reason: str = ""  # for a missing verdict or replacement
+    outliers: tuple[int, ...] = ()  # numbers of the observations left out of all of this
 
     @property
     def tag(self) -> str:
@@ -189,21 +147,11 @@ class JointVerdict:
 
 @dataclass(frozen=True)
 class Plausibility:
-    """Verdicts on all testable joints.
+    """Verdicts on all testable joints."""
 
-    Attributes
-    ----------
-    verdicts
-        One for each pair of frames; a second frame on the same part is another pair.
-    untested
-        Observed frames that test no single operation, with the reason in words.
-    false_alarms
-        Probability of rejecting a joint that is as served.
-    """
-
-    verdicts: tuple[JointVerdict, ...]
-    untested: Mapping[str, str]
-    false_alarms: float
+    verdicts: tuple[JointVerdict, ...]  # for each pair of frames; a second frame of a part is another pair
+    untested: Mapping[str, str]  # observed frames that test no single operation, with the reason in words
+    false_alarms: float  # probability of rejecting a joint that is as served
 
     @property
     def implausible(self) -> tuple[JointVerdict, ...]:

@@ -3,23 +3,25 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, NamedTuple, Self
+from typing import Any, Self
 
+import casadi as ca
 import numpy as np
 import numpy.typing as npt
 
 from kineverse.compilation import CompiledFunction, compile
-from kineverse.errors import KineverseError
-from kineverse.estimation.identification.least_squares import CLOSE, Solution, levenberg_marquardt
-from kineverse.estimation.identification.motion_model import LinearisedPoses, ParameterPrior
+from kineverse.errors import KineverseError, NoSolutionError
+from kineverse.estimation.identification.least_squares import InitialGuess, JointValuePrior, Solution
+from kineverse.estimation.identification.motion_functions import GeneratedMotion, MotionForm, generate
+from kineverse.estimation.identification.motion_model import LinearisedPoses
 from kineverse.estimation.identification.observations import Observations
-from kineverse.estimation.linear_algebra import invert_matrices, log_determinants
+from kineverse.estimation.identification.solver import solver
+from kineverse.estimation.linear_algebra import invert_matrices, log_determinants, multiply_vectors
 from kineverse.expressions.expression import array, as_expression
-from kineverse.lie import Array, exp_so3, log_so3, pose_difference, skew, transform
+from kineverse.lie import Array, pose_difference, skew
 from kineverse.model.constraint import Constraint
 from kineverse.model.model import Model
 from kineverse.model.rates import to_plain
@@ -46,21 +48,26 @@ class KnownJoint:
         others = sorted({s for e in mentioned for s in e.symbols} - {*coordinates}, key=lambda s: s.sort_key)
         default = model.default_state()
         self._others = np.array([default.get(s, s.value or 0.0) for s in others])
-        inputs = (*coordinates, *others)
-        self._linear = compile([pose, *by_coordinate], inputs)
         self.home = np.array([default.get(x, 0.0) for x in coordinates])
+        by_joints = ca.horzcat(ca.SX.zeros(16, 0), *(ca.vec(slope.casadi) for slope in by_coordinate))
+        self._rates: CompiledFunction | None = None
+        self._functions = generate(pose.casadi, others, coordinates, by_joints=by_joints)
+        self.joints = len(coordinates)
         # Redundant coordinates, such as quaternions, move by their speeds. For others, also those moved by
         # wheels, only their values matter.
-        self._rates: CompiledFunction | None = None
-        count = len(coordinates)
-        mobility = np.linalg.matrix_rank(self._twists(self.home[None, :])[1][0])
-        if any(x in rates for x in coordinates) and mobility < count:
+        mobility = np.linalg.matrix_rank(self.linearise(self.home[None, :]).by_joints[0])
+        if any(x in rates for x in coordinates) and mobility < len(coordinates):
             speeds = sorted({v for row in rows for v in row}, key=lambda s: s.sort_key)
             none = as_expression(0.0)
-            self._rates = compile(array([[row.get(v, none) for v in speeds] for row in rows]), inputs)
-            count = len(speeds)
-        self.joints = count
-        limits = [_limits(model, x) for x in coordinates] if self.is_plain else [UNBOUNDED] * count
+            moving = array([[row.get(v, none) for v in speeds] for row in rows])
+            self._rates = compile(moving, (*coordinates, *others))
+            changes = [Symbol(f"plausibility/change {i}") for i in range(len(speeds))]
+            here, change = (ca.vertcat(*(s.sx for s in some)) for some in (coordinates, changes))
+            by_speeds = moving.casadi
+            moved = ca.substitute([pose.casadi, by_joints @ by_speeds], [here], [here + by_speeds @ change])
+            self._functions = generate(moved[0], [*coordinates, *others], changes, by_joints=moved[1])
+            self.joints = len(speeds)
+        limits = [_limits(model, x) for x in coordinates] if self.is_plain else [UNBOUNDED] * self.joints
         self.lower, self.upper = (np.array([pair[side] for pair in limits]) for side in (0, 1))
         there = self.linearise(self.home[None, :])
         self.middle = there.pose[0, :3, 3]
@@ -71,6 +78,14 @@ class KnownJoint:
         """True if the joint values are the coordinates."""
         return self._rates is None
 
+    @cached_property
+    def form(self) -> MotionForm:
+        """Form of the motion by joint values within the limits."""
+        joints = tuple(range(self.joints))
+        # A step turns by at most half a radian.
+        limits = np.array([np.where(self.is_angle, 0.5, math.inf), *self.inner_limits])
+        return MotionForm(self._functions, 6, (), joints, (), joints, limits, np.zeros(self.joints))
+
     def is_equal(self, other: KnownJoint) -> bool:
         """Return True if another joint has the same motion and limits."""
         mine, theirs = ((joint.lower, joint.upper, joint._others) for joint in (self, other))
@@ -78,27 +93,20 @@ class KnownJoint:
 
     def linearise(self, coordinates: Array) -> LinearisedPoses:
         """Evaluate poses at coordinates (N, n), and twists per unit of each joint value."""
-        poses, twists = self._twists(coordinates)
-        if self._rates is not None:
-            twists = twists @ self._rates.batch(self._points(coordinates))
-        return LinearisedPoses(poses, np.zeros((len(poses), 6, 0)), twists)
-
-    def evaluate(self, coordinates: Array) -> tuple[Array, Array]:
-        """Return the pose (4, 4) at one set of coordinates (n,), and twists per unit of each (6, n)."""
-        if not len(coordinates):
-            return self._constant
-        pose, *slopes = self._linear(np.concatenate([coordinates, self._others]))
-        return pose, _twists(pose, slopes)
-
-    @cached_property
-    def _constant(self) -> tuple[Array, Array]:
-        (pose,) = self._linear(self._others)
-        return pose, np.zeros((6, 0))
+        points = self._points(coordinates)
+        if self.is_plain:
+            points = np.roll(points, len(self._others), axis=1)
+        else:
+            points = np.concatenate([points, np.zeros((len(points), self.joints))], axis=1)
+        linear = self._functions.evaluate(points)
+        if not np.isfinite(linear.pose).all():
+            raise NoSolutionError("A joint has no pose there: a loop of the model does not close.")
+        return linear
 
     def retract(self, coordinates: Array, change: Array) -> Array:
         """Return coordinates (N, n) after changes of the joint values (N, k), without limits."""
         if self._rates is not None:
-            change = (self._rates.batch(self._points(coordinates)) @ change[:, :, None])[:, :, 0]
+            change = multiply_vectors(self._rates.batch(self._points(coordinates)), change)
         return np.asarray(coordinates + change)
 
     def per_joint(self, coordinates: Array, slopes: Array) -> Array:
@@ -109,25 +117,30 @@ class KnownJoint:
         others = np.broadcast_to(self._others, (len(coordinates), len(self._others)))
         return np.concatenate([coordinates, others], axis=1)
 
-    def _twists(self, coordinates: Array) -> tuple[Array, Array]:
-        poses, *slopes = self._linear.batch(self._points(coordinates))
-        return poses, _twists(poses, slopes)
-
-    def solve(self, observations: Observations) -> tuple[Array, Solution[KnownMotion]]:
+    def solve(self, observations: Observations) -> tuple[Array, Solution[Any]]:
         """Find the most likely coordinates (N, n) inside the limits, and the solution around them."""
         coordinates = self.initial_coordinates(observations)
-        for _ in range(1 if self.is_plain else _ROUNDS):
-            values = np.zeros((len(observations), self.joints))
-            if self.is_plain:
-                coordinates, values = values, coordinates
-            solution = levenberg_marquardt(observations, KnownMotion(self, coordinates), values)
-            coordinates = self.retract(coordinates, solution.values)
-        return coordinates, solution
+        if self.is_plain:
+            solution = _solve(KnownMotion(self, self._others), observations, coordinates)
+            return solution.values, solution
+        each = []
+        for k in range(len(observations)):
+            one, here = observations.select(slice(k, k + 1)), coordinates[k : k + 1]
+            for _ in range(_ROUNDS):
+                motion = KnownMotion(self, np.append(here, self._others))
+                solution = _solve(motion, one, np.zeros((1, self.joints)))
+                here = self.retract(here, solution.values)
+            coordinates[k] = here[0]
+            each.append(solution)
+        linear = LinearisedPoses(*map(np.concatenate, zip(*(one.linear for one in each), strict=True)))
+        names = ("values", "residuals", "covariance", "parent")
+        joined: Any = {name: np.concatenate([getattr(one, name) for one in each]) for name in names}
+        return coordinates, replace(solution, linear=linear, **joined)
 
     def solve_unbounded(self, observations: Observations, inside: Array) -> Array:
         """Find the most likely coordinates (N, n) without limits; those inside if the pose is undefined."""
         free = copy(self)
-        for name in ("_grid_poses", "inner_limits"):
+        for name in ("_grid_poses", "inner_limits", "form"):
             free.__dict__.pop(name, None)
         free.lower, free.upper = np.full(self.joints, -np.inf), np.full(self.joints, np.inf)
         try:
@@ -182,17 +195,6 @@ class KnownJoint:
         return self.lower + margin, self.upper - margin
 
 
-def _twists(poses: Array, slopes: Sequence[Array]) -> Array:
-    """Return twists (..., 6, n) per unit of each coordinate, from slopes of poses (..., 4, 4)."""
-    twists = np.empty((*poses.shape[:-2], 6, len(slopes)))
-    rows, columns = (2, 0, 1), (1, 2, 0)
-    for j, slope in enumerate(slopes):
-        turned = slope[..., :3, :3] @ np.swapaxes(poses[..., :3, :3], -1, -2)
-        twists[..., :3, j] = slope[..., :3, 3]
-        twists[..., 3:, j] = 0.5 * (turned[..., rows, columns] - turned[..., columns, rows])
-    return twists
-
-
 UNBOUNDED = (-math.inf, math.inf)
 
 
@@ -214,120 +216,34 @@ def is_own_limit(constraint: Constraint, coordinate: Symbol) -> bool:
 
 
 @dataclass(frozen=True)
-class KnownMotion:
-    """Motion model of a served joint: joint values are changes of coordinates (N, n), without parameters."""
+class KnownMotion(GeneratedMotion):
+    """Motion of a served joint without parameters, by its joint values."""
 
     served: KnownJoint
-    reference: Array
-
-    size = 0
+    others: Array  # coordinates and parameters of the model that are no joint values
 
     @property
-    def joints(self) -> int:
-        """Number of joint values."""
-        return self.served.joints
+    def state(self) -> Array:
+        """Coordinates and parameters of the model that are no joint values."""
+        return self.others
 
-    def linearise(self, values: Array) -> LinearisedPoses:
-        """Return the poses at joint values (N, k)."""
-        return self.served.linearise(self.served.retract(self.reference, values))
+    @property
+    def form(self) -> MotionForm:
+        """Form of the served joint."""
+        return self.served.form
 
-    def retract(self, step: Array) -> Self:
+    def with_state(self, state: Array) -> Self:
         """Return itself: there are no parameters."""
         return self
 
-    def retract_joints(self, values: Array, step: Array) -> Array:
-        """Return joint values after a step: at most half a radian at once, and inside the limits."""
-        step = np.where(self.served.is_angle, np.clip(step, -0.5, 0.5), step)
-        return np.asarray(np.clip(values + step, *self.served.inner_limits))
-
-    def prior(self) -> ParameterPrior:
-        """Return the empty prior of no parameters."""
-        return ParameterPrior(np.zeros(0), np.zeros((0, 0)))
+    def log_density(self) -> float:
+        """Return 0: there are no parameters."""
+        return 0.0
 
 
-_STEPS, _STEP = 12, 0.5  # largest number of steps, and largest step of an angle [rad]
-# Squared residual beyond which the true pose of the parent stays at the observed one. The pose that explains
-# a gross error best is many steps away, and of no use.
-_GROSS = 1e3
-_EYE_6 = np.eye(6)
-
-
-class PoseSolution(NamedTuple):
-    """Most likely joint values of one observation inside the limits."""
-
-    values: Array  # (k,)
-    pose: Array  # pose of the joint there, (4, 4), and twists per unit of each joint value, (6, k)
-    by_joints: Array
-    residual: Array  # residual of the relative pose in the parent's axes, (6,), and its covariance, (6, 6)
-    covariance: Array
-
-
-def solve_observation(
-    served: KnownJoint, observations: Observations, start: Array, precision: float
-) -> PoseSolution | None:
-    """Return the solution for one observation of a joint; None if the steps do not converge."""
-    parent, child = observations.parent[0], observations.child[0]
-    of_parent = None if observations.parent_covariance is None else observations.parent_covariance[0]
-    of_child = observations.child_covariance[0]
-    low, high = served.inner_limits
-    values, true = np.clip(start, low, high), parent
-    turned, lever, error, parent_error = np.zeros((6, 6)), np.eye(6), np.empty(6), np.empty(6)
-    covariance = weights = _EYE_6
-    curbed = bool(np.any(served.is_angle))
-    for count in range(_STEPS):
-        pose, by_joints = served.evaluate(values)
-        rotation = true[:3, :3].T
-        error[:3] = rotation @ (child[:3, 3] - true[:3, 3]) - pose[:3, 3]
-        error[3:] = _rotation_vector(rotation @ child[:3, :3] @ pose[:3, :3].T)
-        if of_parent is not None or not count:
-            turned[:3, :3] = turned[3:, 3:] = rotation
-            covariance = turned @ of_child @ turned.T
-            if of_parent is not None:
-                parent_error[:3] = rotation @ (parent[:3, 3] - true[:3, 3])
-                parent_error[3:] = _rotation_vector(rotation @ parent[:3, :3])
-                lever[:3, 3:] = -skew(pose[:3, 3])
-                lifted = turned @ of_parent @ turned.T @ lever.T
-                covariance += lever @ lifted
-                error -= lever @ parent_error
-            weights = np.linalg.inv(covariance)
-        gain, left, there = 0.0, error, values
-        if served.joints:
-            weighted = by_joints.T @ weights
-            curvature = weighted @ by_joints + precision * np.eye(served.joints)
-            slope = weighted @ error - precision * values
-            change = slope / curvature[0] if served.joints == 1 else np.linalg.solve(curvature, slope)
-            if curbed and np.abs(change).max() > _STEP:
-                change = np.where(served.is_angle, np.clip(change, -_STEP, _STEP), change)
-            there = np.minimum(np.maximum(values + change, low), high)
-            # At a limit the step is shorter than the one that the slope asks for.
-            change = there - values
-            gain += float(change @ curvature @ change)
-            left = error - by_joints @ change
-        if of_parent is not None and float(error @ weights @ error) < _GROSS:
-            blame = parent_error + lifted @ (weights @ left)
-            gain += float(np.sum(blame**2 / np.diagonal(of_parent)))
-            if gain >= CLOSE:
-                true = true @ transform(exp_so3(blame[3:]), blame[:3])
-        if gain < CLOSE:
-            return PoseSolution(values, pose, by_joints, error, covariance)
-        values = there
-        if not math.isfinite(gain):
-            return None
-    return None
-
-
-def complete_basis(directions: Array) -> Array:
-    """Return an orthonormal basis of the vectors that are orthogonal to k directions (6, k), (6, 6 - k)."""
-    count = directions.shape[1]
-    if not count:
-        return _EYE_6
-    if count > 1:
-        return np.linalg.qr(directions, mode="complete")[0][:, count:]
-    # Householder's reflection of the direction to the first axis.
-    v = directions[:, 0].copy()
-    v[0] += math.copysign(math.sqrt(float(v @ v)), float(v[0]))
-    square = float(v @ v)
-    return _EYE_6[:, 1:] - np.outer(v, (2.0 / square) * v[1:]) if square else _EYE_6[:, 1:]
+def _solve(motion: Any, observations: Observations, values: Array) -> Solution[Any]:
+    prior = JointValuePrior.vague(motion.joints)
+    return solver.solve(observations, InitialGuess(motion, values), observations.parent, prior)
 
 
 def displacement_jacobian(poses: Array, middle: Array) -> Array:
@@ -340,18 +256,6 @@ def displacement_jacobian(poses: Array, middle: Array) -> Array:
     result[..., :3, 3:6] = -skew(poses[..., :3, 3] - middle)
     result[..., :3, 6:9] = result[..., 3:, 9:] = poses[..., :3, :3]
     return result
-
-
-def _rotation_vector(rotation: Array) -> Array:
-    """Return the rotation vector of one rotation, as :func:`kineverse.lie.log_so3`."""
-    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = rotation.tolist()
-    cosine = 0.5 * (xx + yy + zz - 1.0)
-    if cosine < -0.99:
-        return log_so3(rotation)
-    x, y, z = 0.5 * (zy - yz), 0.5 * (xz - zx), 0.5 * (yx - xy)
-    sine = math.sqrt(x * x + y * y + z * z)
-    factor = 1.0 if sine < 1e-9 else math.atan2(sine, cosine) / sine
-    return np.array([factor * x, factor * y, factor * z])
 
 
 SIZES = (0.01, 0.05, 0.3)  # standard deviations of a displacement, for each component of a twist [m], [rad]
@@ -404,10 +308,6 @@ class KnownResiduals:
 
 def compute_residuals(served: KnownJoint, observations: Observations) -> KnownResiduals:
     """Compute the residuals of observations under a served joint."""
-    if len(observations) == 1 and served.is_plain and observations.rows == 6:
-        single = _compute_one(served, observations)
-        if single is not None:
-            return single
     coordinates, solution = served.solve(observations)
     whitening, error, directions = _whiten(solution)
     transposed = np.swapaxes(directions, 1, 2)
@@ -437,33 +337,6 @@ def compute_residuals(served: KnownJoint, observations: Observations) -> KnownRe
         0.5 * (log_determinants(math.tau * solution.covariance) - log_determinants(math.tau * covariances)),
         *(np.zeros((len(observations), 0)) for _ in range(3)),
     )
-
-
-def _compute_one(served: KnownJoint, observations: Observations) -> KnownResiduals | None:
-    """Compute the residuals of one observation; None if its joint values are not found."""
-    start = served.initial_coordinates(observations)[0] if served.joints else np.zeros(0)
-    solution = solve_observation(served, observations, start, _PRECISION)
-    if solution is None:
-        return None
-    values, pose, by_joints, residual, covariance = solution
-    joints = served.joints
-    triangle = np.linalg.cholesky(covariance)
-    whitening = np.linalg.inv(triangle)
-    error, directions = whitening @ residual, whitening @ by_joints
-    log_scale = float(np.log(np.diagonal(triangle)).sum()) + 0.5 * (6 - joints) * math.log(math.tau)
-    covariances: Array = np.zeros((joints, joints))
-    if joints:
-        covariances = invert_matrices(directions.T @ directions + _PRECISION * np.eye(joints))
-        log_scale -= 0.5 * float(np.linalg.slogdet(covariances)[1])
-    unbounded = values + covariances @ (directions.T @ error)
-    across = complete_basis(directions)
-    orthogonal = across.T @ error
-    deviations = np.sqrt(np.diagonal(covariances))
-    excess = np.concatenate([served.lower - unbounded, unbounded - served.upper]) / np.tile(deviations, 2)
-    displaced = across.T @ whitening @ displacement_jacobian(pose, served.middle)
-    parts = (values, unbounded, covariances, orthogonal, across @ orthogonal, displaced, excess, residual)
-    none = np.zeros((1, 0))
-    return KnownResiduals(*[*(part[None] for part in parts), np.array([log_scale]), none, none, none])
 
 
 def orthogonal_residuals(solution: Solution[Any]) -> Array:

@@ -5,18 +5,13 @@ from typing import TYPE_CHECKING
 from kineverse._lazy import lazy_face
 
 if TYPE_CHECKING:
-    from .joint_model import make_joint_model as make_joint_model
-    from kineverse.estimation.correlation import (
-        correlation_time as correlation_time,
-        effective_sample_size as effective_sample_size,
-    )
-
     from .reader import read_recording as read_recording
     from .recorded_joint import (
         Assumption as Assumption,
         ObservationNoise as ObservationNoise,
         RecordedJoint as RecordedJoint,
         identify_recorded_joint as identify_recorded_joint,
+        make_joint_model as make_joint_model,
     )
     from .recording import (
         RecordedPair as RecordedPair,

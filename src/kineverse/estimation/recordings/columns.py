@@ -88,7 +88,7 @@ _ROS = re.compile(r"(?:pose|transform)[./](?:position|translation)[./][xyz]$")
 # Fields of messages that say nothing about the part, and those that are no poses.
 _WRAPPER = re.compile(r"^field\b|(?:^|[./:_ ]+)(?:pose|transform)$", re.IGNORECASE)
 _NO_POSE = re.compile(
-    r"(?:.*[./:_ ])?(?:twist|linear|angular|velocity|vel|acceleration|accel|acc|force|torque|wrench|gyro"
+    r"(?:.*[./:_ ])?(?:twist|linear|angular|velocity|vel|acceleration|accel|acc|force|torque|wrench|gyro|mag"
     r"|covariance|cov|std|sigma|error|gravity|size|scale|dimensions|bias)(?:[./:_ ].*)?|[a-z](?:_.*)?_",
     re.IGNORECASE,
 )

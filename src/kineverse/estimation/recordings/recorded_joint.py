@@ -1,12 +1,12 @@
-"""Identification of the joint of a recorded pair, and the sensitivity of the answer to assumptions.
+"""Joint of a recorded pair: its identification, the sensitivity to assumptions, and its model.
 
 Errors of neighbouring rows are correlated. N rows with an autocorrelation time τ count as N / τ, see
 :mod:`kineverse.estimation.correlation`. The residuals of each family have their own time, because they
 contain the misfit of the family. The time of the most probable family is used, and the comparison is repeated
 until it agrees with the family that it makes most probable.
 
-The answer is compared with those under other assumptions: the times of other families, half and twice the
-noise, and the noise of the residuals if another one is stated. An assumption about the noise counts if the
+The answer is compared with those under other assumptions: the times of other families, twice the noise, and
+the noise of the residuals if another one is stated. An assumption about the noise counts if the
 observations are not much less probable under it than under the best of these.
 
 A joint with several joint values explains noise that is larger in one direction, such as a camera's depth,
@@ -18,20 +18,28 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from kineverse.articulations.mechanisms.mechanism import BLUE, RED, box_shape, rod_shape, shift
 from kineverse.errors import InvalidValueError
 from kineverse.estimation.correlation import LEAST_EFFECTIVE, correlation_time
 from kineverse.estimation.identification import Fit, IdentificationResult, identify
 from kineverse.estimation.identification.curve import CURVE
 from kineverse.estimation.identification.joint_identification import WEIGHTS
+from kineverse.estimation.identification.joint_operations import joint_operation
 from kineverse.estimation.identification.model_check import CALIBRATED
 from kineverse.estimation.identification.observations import check_observations
 from kineverse.estimation.identification.result import complete_fit
 from kineverse.estimation.noise import Outliers, pose_covariance
 from kineverse.lie import Array
+from kineverse.model.basic_operations import SetBody
+from kineverse.model.body import Body, Rgba, Shape, Sphere
+from kineverse.model.frame import WORLD
+from kineverse.model.model import Model
+from kineverse.model.operation import Operation
+from kineverse.spatial import translation
 
 from .recording import Indices, RecordedPair, spaced_indices
 
@@ -52,20 +60,11 @@ _AS_SMOOTH, _SMOOTHER = 1.5, 3.0
 
 @dataclass(frozen=True)
 class ObservationNoise:
-    """Assumed noise of the observations.
+    """Assumed noise of the observations."""
 
-    Attributes
-    ----------
-    position, orientation
-        Standard deviations of each coordinate [m] and about each axis [rad]; orientation is None if only
-        positions are observed.
-    given
-        True if they are stated, False if estimated.
-    """
-
-    position: float
-    orientation: float | None
-    given: bool
+    position: float  # standard deviation of each coordinate [m]
+    orientation: float | None  # and about each axis [rad]; None if only positions are observed
+    given: bool  # True if they are stated, False if estimated
 
     def scaled(self, factor: float) -> ObservationNoise:
         """Return the noise with standard deviations that are larger by a factor."""
@@ -80,52 +79,24 @@ class ObservationNoise:
 
 @dataclass(frozen=True, eq=False)
 class Assumption:
-    """Noise and autocorrelation time of the errors, and the joint that is identified with these.
+    """Noise and autocorrelation time of the errors, and the joint that is identified with these."""
 
-    Attributes
-    ----------
-    noise
-        Noise of single observations.
-    correlation_time
-        Autocorrelation time of their errors, in rows.
-    found
-        All families, with their probabilities.
-    """
-
-    noise: ObservationNoise
-    correlation_time: float
-    found: IdentificationResult
+    noise: ObservationNoise  # of single observations
+    correlation_time: float  # autocorrelation time of their errors, in rows
+    found: IdentificationResult  # all families, with their probabilities
 
 
 @dataclass(frozen=True, eq=False)
 class RecordedJoint:
-    """Joint identified from a recorded pair.
+    """Joint identified from a recorded pair."""
 
-    Attributes
-    ----------
-    found
-        All families, with their probabilities.
-    noise
-        Noise of single observations.
-    correlation_time
-        Autocorrelation time of their errors, in rows.
-    repeated
-        Number of rows that equal the one before. They do not count.
-    judged
-        Effective sample size by which the families were compared.
-    fit
-        Fit of the most probable family to all poses, outliers marked.
-    objections
-        Assumptions that the observations allow as well, under which the answer is different.
-    """
-
-    found: IdentificationResult
-    noise: ObservationNoise
-    correlation_time: float
-    repeated: int
-    judged: int
-    fit: Fit
-    objections: tuple[Assumption, ...] = ()
+    found: IdentificationResult  # all families, with their probabilities
+    noise: ObservationNoise  # of single observations
+    correlation_time: float  # autocorrelation time of their errors, in rows
+    repeated: int  # number of rows that equal the one before; they do not count
+    judged: int  # effective sample size by which the families were compared
+    fit: Fit  # of the most probable family to all poses, outliers marked
+    objections: tuple[Assumption, ...] = ()  # under which the answer is different, and which are possible
 
     @property
     def is_ambiguous(self) -> bool:
@@ -272,7 +243,7 @@ class _Comparison:
                 other = self.assume(_largest_noise(fit).scaled(_AMPLE), best.correlation_time, rows)
                 if other.found.best.family == name:
                     yield other
-        noises = [best.noise.scaled(0.5), best.noise.scaled(2.0)]
+        noises = [best.noise.scaled(2.0)]
         if stated is not None:
             noises.append(self.assume(None, best.correlation_time, rows).noise)
         others = [self.assume(noise, best.correlation_time, rows) for noise in noises]
@@ -318,16 +289,79 @@ def _largest_noise(fit: Fit) -> ObservationNoise:
     return ObservationNoise(float(deviations[:3].max()), orientation, True)
 
 
-def residual_noise(fit: Fit) -> ObservationNoise:
-    """Return noise of the size of the residuals. Directions of joint values have none."""
-    (position, orientation), joints = fit.rms, fit.motion.joints
-    if fit.rows == 3:
-        return ObservationNoise(position / math.sqrt(max(1.0, 3.0 - joints)), None, True)
-    root = math.sqrt(max(0.5, 3.0 - 0.5 * joints))
-    return ObservationNoise(position / root, orientation / root, True)
-
-
 def log_probability(result: IdentificationResult) -> float:
     """Return the log probability density of the observations, families weighed by their priors."""
     best = result.best
     return best.log_evidence + math.log(WEIGHTS[best.family] / best.probability)
+
+
+_ORANGE: Rgba = (0.93, 0.56, 0.17, 1.0)
+
+_DOTS = 60  # largest number of observed poses drawn in the model
+
+
+def make_joint_model(pair: RecordedPair, fit: Fit) -> Model:
+    """Return a model with the joint, and shapes of its axis, the child and the observed positions.
+
+    If only positions are observed, the child's axes are those of its parent at joint value 0. Such a part
+    that moves freely has no joint.
+    """
+    if fit.family == "free" and fit.motion.rows == 3:
+        raise InvalidValueError(f"'{pair.child}' moves freely: there is no joint to write.")
+    model = Model()
+    positions = pair.relative[:, :3, 3] if pair.relative.ndim == 3 else pair.relative
+    size = max(float(np.ptp(positions, axis=0).max()), 0.01)
+    with model.edit() as edit:
+        if pair.parent != WORLD:
+            edit.add_frame(pair.parent, WORLD, translation(0, 0, 0))
+        edit.apply(_make_operation(fit, pair.parent, pair.child), tag=pair.child)
+        edit.apply(SetBody(pair.parent, Body(_parent_shapes(fit, positions, size))))
+        edit.apply(SetBody(pair.child, Body(_child_shapes(fit, size))))
+    return model
+
+
+def _make_operation(fit: Fit, parent: str, child: str) -> Operation:
+    """Return the joint as an operation; for positions alone see :func:`make_joint_model`."""
+    if fit.motion.rows == 6 or fit.family == CURVE:
+        return fit.operation(name=child, parent=parent, child=child, as_point=True)
+    right = fit.motion.right.copy()
+    right[:3, :3] = fit.motion.left[:3, :3].T
+    limits = [(float(low), float(high)) for low, high in fit.range]
+    return joint_operation(replace(fit.motion, right=right), limits, child, parent, child)
+
+
+def _parent_shapes(fit: Fit, positions: Array, size: float) -> tuple[Shape, ...]:
+    """Return the axis, and dots at observed positions, in the parent's frame."""
+    dots = positions[spaced_indices(len(positions), _DOTS)]
+    parts = [Shape(Sphere(0.008 * size), shift(*map(float, dot)), color=_ORANGE) for dot in dots]
+    if "axis" in fit.parameters:
+        half = 0.5 * size * np.asarray(fit.parameters["axis"])
+        middle = _closest_point_on_axis(fit, positions.mean(axis=0))
+        parts.append(_rod(middle - half, middle + half, size, RED))
+    return tuple(parts)
+
+
+def _child_shapes(fit: Fit, size: float) -> tuple[Shape, ...]:
+    """Return a box for the child, and a rod from it to its axis if there is one, in the child's frame."""
+    side = 0.06 * size
+    parts = [box_shape((side, side, side), (0.0, 0.0, 0.0), BLUE)]
+    if "point" in fit.parameters:
+        reference = np.asarray(fit.parameters["reference"])
+        rotation = reference[:3, :3] if fit.motion.rows == 6 else np.eye(3)
+        arm = rotation.T @ (_closest_point_on_axis(fit, reference[:3, 3]) - reference[:3, 3])
+        if np.linalg.norm(arm) > 0.01 * size:
+            parts.append(_rod(np.zeros(3), arm, size, BLUE))
+    return tuple(parts)
+
+
+def _rod(start: Array, end: Array, size: float, color: Rgba) -> Shape:
+    (a, b, c), (x, y, z) = start.tolist(), end.tolist()
+    return rod_shape((a, b, c), (x, y, z), 0.012 * size, color)
+
+
+def _closest_point_on_axis(fit: Fit, position: Array) -> Array:
+    """Return the point of the axis closest to a position; the position itself if there is no axis."""
+    if "point" not in fit.parameters:
+        return position
+    axis, point = np.asarray(fit.parameters["axis"]), np.asarray(fit.parameters["point"])
+    return np.asarray(point + (axis @ (position - point)) * axis)

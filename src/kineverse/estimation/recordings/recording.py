@@ -18,27 +18,13 @@ Indices = npt.NDArray[np.intp]
 
 @dataclass(frozen=True, eq=False)
 class RecordedTrack:
-    """Recorded poses of one part.
+    """Recorded poses of one part."""
 
-    Attributes
-    ----------
-    poses
-        (N, 4, 4) in the observer's frame [m]; (N, 3) for positions only.
-    rows
-        Rows of the table, (N,); parts in one row were observed at one time.
-    lines
-        Lines of the file, (N,).
-    times
-        (N,) [s]; None if the table has no times.
-    frame
-        Name of the frame that the poses are in; empty if it is not known.
-    """
-
-    poses: Array
-    rows: Indices
-    lines: Indices
-    times: Array | None = None
-    frame: str = ""
+    poses: Array  # (N, 4, 4) in the observer's frame [m]; (N, 3) for positions only
+    rows: Indices  # of the table, (N,); parts in one row were observed at one time
+    lines: Indices  # of the file, (N,)
+    times: Array | None = None  # (N,) [s]; None if the table has no times
+    frame: str = ""  # name of the frame that the poses are in; empty if it is not known
 
     @property
     def has_orientation(self) -> bool:
@@ -56,31 +42,15 @@ def spaced_indices(count: int, size: int) -> Indices:
 
 @dataclass(frozen=True, eq=False)
 class RecordedPair:
-    """Synchronised poses of two parts.
-
-    Attributes
-    ----------
-    parent, child
-        Names of the parts.
-    parent_poses
-        (N, 4, 4); None for the world, which is known exactly.
-    child_poses
-        (N, 4, 4) or (N, 3).
-    lines
-        Lines of the child's poses in the file, (N,).
-    unpaired
-        Number of poses of one part without the other.
-    is_timed
-        True if the poses are in order of time.
-    """
+    """Synchronised poses of two parts."""
 
     parent: str
     child: str
-    parent_poses: Array | None
-    child_poses: Array
-    lines: Indices
-    unpaired: int = 0
-    is_timed: bool = False
+    parent_poses: Array | None  # (N, 4, 4); None for the world, which is known exactly
+    child_poses: Array  # (N, 4, 4) or (N, 3)
+    lines: Indices  # of the child's poses in the file, (N,)
+    unpaired: int = 0  # number of poses of one part without the other
+    is_timed: bool = False  # True if the poses are in order of time
 
     @property
     def has_orientation(self) -> bool:
@@ -110,13 +80,7 @@ class RecordedPair:
         return result
 
     def thin(self, count: int) -> RecordedPair:
-        """Return at most ``count`` evenly spaced observations.
-
-        Raises
-        ------
-        InvalidValueError
-            If ``count`` is less than two.
-        """
+        """Return at most ``count`` evenly spaced observations."""
         if count < 2:
             raise InvalidValueError(f"{count} of the poses: a motion takes at least two.")
         return self.select(spaced_indices(len(self.lines), count))
@@ -129,41 +93,18 @@ class RecordedPair:
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """Recorded tracks of a table.
+    """Recorded tracks of a table."""
 
-    Attributes
-    ----------
-    source
-        Name of the file in messages.
-    tracks
-        Tracks by name of the part; a table without names has one, called "".
-    ignored
-        Columns without meaning.
-    assumptions
-        Meanings that the table leaves open, such as "angles in deg".
-    """
-
-    source: str
-    tracks: Mapping[str, RecordedTrack]
-    ignored: tuple[str, ...] = ()
-    assumptions: tuple[str, ...] = ()
+    source: str  # name of the file in messages
+    tracks: Mapping[str, RecordedTrack]  # by name of the part; a table without names has one, called ""
+    ignored: tuple[str, ...] = ()  # columns without meaning
+    assumptions: tuple[str, ...] = ()  # about what the table leaves open, such as "angles in deg"
 
     def pair(self, parent: str = WORLD, child: str | None = None) -> RecordedPair:
         """Synchronise the poses of two parts.
 
-        Parameters
-        ----------
-        parent
-            Name of the parent. ``world`` stands for the observer's frame, unless a part has this name.
-        child
-            Name of the child; None for the only other part. A table without names has one part, of any name.
-
-        Raises
-        ------
-        UnknownNameError
-            If there is no such part, or the child is ambiguous.
-        FormatError
-            If the parent's orientation is missing, or the two were never observed together.
+        ``world`` stands for the observer's frame, unless a part has this name. None is the only other part.
+        A table without names has one part, of any name.
         """
         others = [name for name in self.tracks if name != parent]
         if child is None:

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import TYPE_CHECKING, NamedTuple
 
+import casadi as ca
 import numpy as np
 
 from kineverse.compilation import compile
@@ -197,53 +199,29 @@ class SpeedLocks:
         return self._all - {v for v, is_locked in zip(self._speeds, still.tolist(), strict=True) if is_locked}
 
 
-_LEAST = 1e-12
+_FEASIBLE = 1e-6  # largest violation of a bound, in deviations; that of a solution is a millionth of it
 
 
 def solve_bounded_qp(matrix: Array, vector: Array, rows: Array, lower: Array, upper: Array) -> Array | None:
-    """Minimise ½xᵀAx - vᵀx subject to lower <= rows x <= upper; return None if infeasible.
+    """Minimise ½xᵀAx - vᵀx subject to lower <= rows x <= upper; return None if infeasible."""
+    x: Array = inverse_spd(matrix) @ vector
+    if ((rows @ x >= lower) & (rows @ x <= upper)).all():
+        return x
+    # Tolerances are absolute: unknowns have deviations of 1, and rows are of length 1.
+    unit = np.diag(matrix) ** -0.5
+    length = np.linalg.norm(rows * unit, axis=1)
+    length[length == 0.0] = 1.0
+    solver = _qp_solver(*rows.shape)
+    a, h = rows * unit / length[:, None], matrix * np.outer(unit, unit)
+    result = solver(h=h, g=-vector * unit, a=a, lba=lower / length, uba=upper / length)
+    x = np.asarray(result["x"]).reshape(-1) * unit
+    beyond = np.maximum(lower - rows @ x, rows @ x - upper) / length
+    return x if beyond.max() < _FEASIBLE else None
 
-    The dual method starts at the unconstrained minimum and adds violated bounds one by one, so most calls end
-    at once (Goldfarb and Idnani, A numerically stable dual method for solving strictly convex quadratic
-    programs, 1983).
-    """
-    inverse = inverse_spd(matrix)
-    x = inverse @ vector
-    normals = np.concatenate([rows, -rows])
-    bounds = np.concatenate([lower, -upper])
-    scale = _LEAST * (1.0 + np.where(np.isfinite(bounds), np.abs(bounds), 0.0))
-    active: list[int] = []
-    multipliers = np.empty(0)
-    for _ in range(100 * len(bounds) + 100):
-        slack = normals @ x - bounds
-        slack[active] = 0.0
-        worst = int(np.argmin(slack + scale)) if len(slack) else -1
-        if worst < 0 or slack[worst] >= -scale[worst]:
-            return x
-        normal, added = normals[worst], 0.0
-        while True:
-            held = normals[active]
-            direction = inverse @ normal
-            relation = np.empty(0)
-            if active:
-                relation = np.linalg.lstsq(held @ inverse @ held.T, held @ direction, rcond=None)[0]
-                direction = direction - inverse @ held.T @ relation
-            along = float(direction @ normal)
-            pairs = enumerate(zip(multipliers, relation, strict=True))
-            partial, leaving = min([(m / r, k) for k, (m, r) in pairs if r > _LEAST], default=(np.inf, -1))
-            is_free = along > _LEAST * float(normal @ inverse @ normal)
-            full = -(float(normal @ x) - bounds[worst]) / along if is_free else np.inf
-            step = min(partial, full)
-            if not np.isfinite(step):
-                return None
-            if is_free:
-                x = x + step * direction
-            multipliers = multipliers - step * relation
-            added += step
-            if full <= partial:
-                active.append(worst)
-                multipliers = np.append(multipliers, added)
-                break
-            del active[leaving]
-            multipliers = np.delete(multipliers, leaving)
-    return None
+
+@lru_cache
+def _qp_solver(bounds: int, unknowns: int) -> ca.Function:
+    """Return the solver DAQP (Arnström, Bemporad, Axehill 2022), which CasADi contains."""
+    shapes = {"h": ca.Sparsity.dense(unknowns, unknowns), "a": ca.Sparsity.dense(bounds, unknowns)}
+    options = {"primal_tol": 1e-12, "zero_tol": 1e-15, "pivot_tol": 1e-12}
+    return ca.conic("qp", "daqp", shapes, {"error_on_fail": False, "daqp": options})

@@ -61,7 +61,6 @@ class HypothesisBank:
             raise InvalidValueError(f"Probabilities are positive, not {weights!r}.")
         self._forgetting = as_tolerance(forgetting, "The rate of forgetting")
         self._logs = {name: math.log(w) for name, w in weights.items()}
-        self._estimates = {name: tracker.estimate for name, tracker in self._trackers.items()}
 
     @property
     def trackers(self) -> Mapping[str, Tracker]:
@@ -71,7 +70,7 @@ class HypothesisBank:
     @property
     def estimates(self) -> Mapping[str, Estimate]:
         """Estimate of each tracker, by name."""
-        return MappingProxyType(self._estimates)
+        return {name: tracker.estimate for name, tracker in self._trackers.items()}
 
     @property
     def probabilities(self) -> dict[str, float]:
@@ -87,8 +86,9 @@ class HypothesisBank:
     def predict(self, dt: float, **options: Any) -> None:
         """Predict all trackers, see :meth:`.Tracker.predict`; commands go to those they move."""
         moved = {name: tracker.copy() for name, tracker in self._trackers.items()}
-        estimates = {name: tracker.predict(dt, **options) for name, tracker in moved.items()}
-        self._trackers, self._estimates = moved, estimates
+        for tracker in moved.values():
+            tracker.predict(dt, **options)
+        self._trackers = moved
         self._forget(dt)
 
     def update(self, measurements: Mapping[str, Any], **options: Any) -> dict[str, float]:
@@ -98,15 +98,14 @@ class HypothesisBank:
         """
         # Copies share compiled code. After an error the originals are unchanged.
         after = {name: tracker.copy() for name, tracker in self._trackers.items()}
-        stamps = {name: tracker.estimate.stamp for name, tracker in after.items()}
-        estimates = {name: tracker.update(measurements, **options) for name, tracker in after.items()}
-        first = next(iter(after))
-        began, now = stamps[first], estimates[first].stamp
+        for tracker in after.values():
+            tracker.update(measurements, **options)
+        began, now = (next(iter(each.values())).estimate.stamp for each in (self._trackers, after))
         if began is not None and now is not None:
             self._forget(now - began)
-        for name, estimate in estimates.items():
-            self._logs[name] += estimate.log_evidence - self._trackers[name].log_evidence
-        self._trackers, self._estimates = after, estimates
+        for name, tracker in after.items():
+            self._logs[name] += tracker.log_evidence - self._trackers[name].log_evidence
+        self._trackers = after
         return self.probabilities
 
     def _forget(self, dt: float) -> None:

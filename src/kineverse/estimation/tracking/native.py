@@ -8,7 +8,8 @@ from __future__ import annotations
 import ctypes
 import math
 import threading
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence, Sized
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -55,19 +56,15 @@ class NativeMapSolver:
 
     def __init__(self, solver: MapSolver, function: CompiledFunction) -> None:
         self._solver, self._function = solver, function
-        layout, groups = solver.layout, solver.layout.groups
-        count, size, directions = (
-            len(groups),
-            len(layout.tangent_space.coordinates),
-            len(layout.tangent_space.tangent),
-        )
+        layout, groups, space = solver.layout, solver.layout.groups, solver.layout.tangent_space
+        count, observed = len(groups), layout.observations
+        size, directions = len(space.coordinates), len(space.tangent)
         self._motions = [solver.process_model.flow(number) for number in range(count)]
         is_varying = [np.empty(0) if m is None else m.is_varying.reshape(-1) for m in self._motions]
         self._size, self._is_linear = size, not (solver.process_model.has_rates or layout.limits)
-        limits = [layout.limit_slices[k].start for group in groups for k in group.limits]
         indices: dict[str, Any] = {
-            "is_pose": [one.is_pose for one in layout.observations],
-            "size": [one.size for one in layout.observations],
+            "is_pose": [one.is_pose for one in observed],
+            "size": [one.size for one in observed],
             "value": [where.start for where in layout.value_slices],
             "slope": [where.start for where in layout.jacobian_slices],
             "seen": [where.start for where in layout.measurement_slices],
@@ -80,45 +77,36 @@ class NativeMapSolver:
             "first_watch": _starts(group.observation_indices for group in groups),
             "watch": [i for group in groups for i in group.observation_indices],
             "first_limit": _starts(group.limits for group in groups),
-            "limit": limits,
+            "limit": [layout.limit_slices[k].start for group in groups for k in group.limits],
             "rates": np.zeros(count),
             "step": np.zeros(count),
             "first_bend": _starts(is_varying),
         }
-        self._reading = Measurements(
-            np.zeros(layout.measurement_slices[-1].stop),
-            np.zeros(len(layout.observations), dtype=bool),
-            np.zeros(layout.whitening_slices[-1].stop),
-            np.zeros(len(layout.observations)),
-        )
+        numbers = InformationState((size, directions, count)).numbers.size
         room = (
-            3 * len(g.t) + 3 * len(g.t) ** 2 + 2 * len(g.x) + len(g.limits) * (3 + len(g.t)) for g in groups
+            len(g.t) * (3 + 3 * len(g.t) + len(g.limits)) + 2 * len(g.x) + 3 * len(g.limits) for g in groups
         )
-        self._input, self._outlier = np.zeros(len(layout.arguments)), np.zeros(len(layout.observations))
-        self._selected = np.zeros(count, dtype=np.uint8)
-        self._belief, self._prior = np.zeros((2, *InformationState((size, directions, count)).numbers.shape))
-        self._by_group, self._by_observation = np.zeros((2, count)), np.zeros((2, len(layout.observations)))
-        numbers = {
-            "bend": np.concatenate(is_varying).astype(np.float64),
-            "period": np.array([one.period for one in layout.observations]),
-            "lower": solver.limits.lower,
-            "upper": solver.limits.upper,
-            "input": self._input,
-            "output": np.zeros(function.shapes[0]),
-            "work": np.zeros(sum(room)),
-            **dict(zip(("numbers", "mask", "whitening", "log_scale"), self._reading, strict=True)),
-            "outlier": self._outlier,
-            "selected": self._selected,
-            "belief": self._belief,
-            "prior": self._prior,
-            **dict(zip(("nis", "dof"), self._by_group, strict=True)),
-            **dict(zip(("squares", "weights"), self._by_observation, strict=True)),
+        sizes = {
+            **dict.fromkeys(("log_scale", "outlier", "squares", "weights"), len(observed)),
+            **{"nis": count, "dof": count, "belief": numbers, "prior": numbers, "work": sum(room)},
+            **{"input": len(layout.arguments), "output": function.shapes[0][0]},
+            "numbers": layout.measurement_slices[-1].stop,
+            "whitening": layout.whitening_slices[-1].stop,
         }
         self._indices = {name: np.array(v, dtype=np.int64) for name, v in indices.items()}
-        self._numbers = numbers  # the problem has their addresses only
-        counts = (len(layout.observations), count, size, directions, len(layout.inputs))
-        self._problem = _Problem(0, *counts)
-        for name, array in (*self._indices.items(), *numbers.items()):
+        # The problem has the addresses of these arrays only.
+        self._arrays = arrays = SimpleNamespace(
+            **{name: np.zeros(size) for name, size in sizes.items()},
+            bend=np.concatenate(is_varying).astype(np.float64),
+            period=np.array([one.period for one in observed]),
+            lower=solver.limits.lower,
+            upper=solver.limits.upper,
+            mask=np.zeros(len(observed), dtype=bool),
+            selected=np.zeros(count, dtype=np.uint8),
+        )
+        self._reading = Measurements(arrays.numbers, arrays.mask, arrays.whitening, arrays.log_scale)
+        self._problem = _Problem(0, len(observed), count, size, directions, len(layout.inputs))
+        for name, array in (*self._indices.items(), *vars(arrays).items()):
             setattr(self._problem, name, array.ctypes.data)
         self._address = ctypes.addressof(self._problem)
         self._motion = np.zeros((2, size))
@@ -159,24 +147,25 @@ class NativeMapSolver:
         loss: Loss = "gaussian",
     ) -> MapResult | None:
         """Update some groups as :meth:`.MapSolver.update`; None on any difficulty, which numpy reports."""
-        log_inlier = 0.0
+        arrays, log_inlier = self._arrays, 0.0
         with self._lock:
             self._load(reading)
-            self._belief[:] = self._prior[:] = belief.numbers
-            self._input[self._size :] = inputs
-            are_all = len(groups) == len(self._selected)
-            self._selected[:] = are_all
+            arrays.belief[:] = arrays.prior[:] = belief.numbers
+            arrays.input[self._size :] = inputs
+            arrays.selected[:] = are_all = len(groups) == len(arrays.selected)
             if not are_all:
-                self._selected[groups] = 1
+                arrays.selected[groups] = 1
             if loss == "mixture" and self._solver.outliers is not None:
-                self._outlier[:] = self._solver.outlier_densities(reading)
+                arrays.outlier[:] = self._solver.outlier_densities(reading)
                 log_inlier = math.log(1 - self._solver.outliers.fraction)
             rounds = native_library.code.update(self._address, _LOSSES.index(loss), log_inlier)
             if rounds < 0:
                 return None
-            after, prior = self._belief.copy(), self._prior.copy()
-            prior[: self._size] = after[: self._size]
-            (nis, dof), (squares, weights) = self._by_group.copy(), self._by_observation.copy()
+            after, prior, nis, dof = (
+                each.copy() for each in (arrays.belief, arrays.prior, arrays.nis, arrays.dof)
+            )
+            squares, weights = arrays.squares.copy(), arrays.weights.copy()
+        prior[: self._size] = after[: self._size]
         return MapResult(belief.with_numbers(after), prior, nis, dof, rounds, squares, weights)
 
     def predict(
@@ -186,10 +175,10 @@ class NativeMapSolver:
         if not self._is_linear:
             return None
         with self._lock:
-            self._belief[:] = belief.numbers
+            self._arrays.belief[:] = belief.numbers
             self._motion[0], self._motion[1] = displacement, added_variance
             is_done = native_library.code.predict(self._address, *self._motion_addresses) >= 0
-            return belief.with_numbers(self._belief.copy()) if is_done else None
+            return belief.with_numbers(self._arrays.belief.copy()) if is_done else None
 
     def are_rigid(self, reading: Measurements) -> bool:
         """Return True if all measured poses are rigid; False if that is unknown."""
@@ -208,5 +197,5 @@ class NativeMapSolver:
         self._loaded = reading
 
 
-def _starts(parts: Any) -> Array:
+def _starts(parts: Iterable[Sized]) -> Array:
     return np.cumsum([0, *map(len, parts)])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Collection, Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import pairwise
+from itertools import combinations, pairwise
 from typing import TypeVar
 
 import numpy as np
@@ -23,7 +23,7 @@ from kineverse.model.model import Model
 from kineverse.model.operation import Operation
 
 from .loop_closures import LoopClosure, ObservedLoop, close_loops, closes_loop
-from .pairwise import FamilyChoice, PartPair, identify_pair, identify_pairs
+from .pairwise import FamilyChoice, PartPair, identify_pair
 
 NodeT = TypeVar("NodeT", bound=Hashable)
 
@@ -408,7 +408,13 @@ def identify_graph(
             "Only positions were observed, of all parts. The parent of a part has to be observed as a pose, "
             "(N, 4, 4); the world is one, unless world=False."
         )
-    pairs = identify_pairs(tracks, families, progress)
+    names, report = list(combinations(tracks, 2)), progress or (lambda done, count: None)
+    pairs: dict[frozenset[str], PartPair] = {}
+    for done, (a, b) in enumerate(names):
+        report(done, len(names))
+        if (pair := identify_pair(tracks, a, b, families)) is not None:
+            pairs[frozenset((a, b))] = pair
+    report(len(names), len(names))
     bodies = find_rigid_bodies(tracks, pairs)
     firsts = [body.parts[0] for body in bodies]
     between = {c: p for c, p in pairs.items() if c <= set(firsts)}

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from itertools import combinations
 
 import numpy as np
 import numpy.typing as npt
@@ -76,7 +75,8 @@ def identify_pair(
     weights = {str(getattr(f, "name", f)): w for f, w in _joint_weights(families).items()}
     best = result.best
     log = best.log_evidence + math.log(weights[best.family] / best.probability / sum(weights.values()))
-    squares = float(squared_errors(best.residuals, relative_covariance(observations, best)).sum())
+    relative, of_child = _relative_covariances(observations, best)
+    squares = float(squared_errors(best.residuals, relative).sum())
     expected = max(best.residuals.size - best.joint_values.size - len(best.covariance), 1)
     explained = abs(squares - expected) < SURPRISE_DEVIATIONS * math.sqrt(2.0 * expected)
     if explained:
@@ -84,35 +84,24 @@ def identify_pair(
         log += 0.5 * (squares - expected)
     if a.covariances is not None:
         # The noise of the parent must not favour a connection to the world, which is exact.
-        log += _log_volume(relative_covariance(observations, best), best)
-        log -= _log_volume(child_covariance(observations), best)
+        log += _log_volume(relative, best) - _log_volume(of_child, best)
     rotation = 0.0 if b.is_point else _LOG_ROTATION
     log += LOG_ANYWHERE - _LOG_ROTATION + rotation - len(times) * (_LOG_ROOM + rotation)
     return PartPair(parent, child, result, times, log, explained)
 
 
-def relative_covariance(observations: Observations, fit: Fit) -> Array:
-    """Return the covariances of observed relative poses or positions, in the parent's axes, (N, m, m)."""
-    covariance = child_covariance(observations)
-    if observations.parent_covariance is not None:
-        lever = np.tile(np.eye(6), (len(observations), 1, 1))
-        lever[:, :3, 3:] = -skew(fit.poses[:, :3, 3])
-        carried = lever[:, : observations.rows] @ _parent_rotations(observations, 6)
-        covariance = covariance + carried @ observations.parent_covariance @ np.swapaxes(carried, 1, 2)
-    return covariance
-
-
-def child_covariance(observations: Observations) -> Array:
-    """Return the covariances of the child's observed pose or position, in the parent's axes, (N, m, m)."""
-    rotation = _parent_rotations(observations, observations.rows)
-    return np.asarray(rotation @ observations.child_covariance @ np.swapaxes(rotation, 1, 2))
-
-
-def _parent_rotations(observations: Observations, rows: int) -> Array:
-    p_R_w = np.swapaxes(observations.parent[:, :3, :3], 1, 2)
-    rotation = np.zeros((len(p_R_w), 6, 6))
-    rotation[:, :3, :3] = rotation[:, 3:, 3:] = p_R_w
-    return rotation[:, :rows, :rows]
+def _relative_covariances(observations: Observations, fit: Fit) -> tuple[Array, Array]:
+    """Return the covariances of observed relative and of child's poses, in the parent's axes, (N, m, m)."""
+    rows, turn = observations.rows, np.zeros((len(observations), 6, 6))
+    turn[:, :3, :3] = turn[:, 3:, 3:] = np.swapaxes(observations.parent[:, :3, :3], 1, 2)
+    of_child = turn[:, :rows, :rows]
+    child = of_child @ observations.child_covariance @ np.swapaxes(of_child, 1, 2)
+    if observations.parent_covariance is None:
+        return child, child
+    lever = np.tile(np.eye(6), (len(observations), 1, 1))
+    lever[:, :3, 3:] = -skew(fit.poses[:, :3, 3])
+    carried = lever[:, :rows] @ turn
+    return child + carried @ observations.parent_covariance @ np.swapaxes(carried, 1, 2), child
 
 
 def _log_volume(covariance: Array, fit: Fit) -> float:
@@ -142,17 +131,3 @@ def _joint_weights(families: FamilyChoice) -> dict[str | Family, float]:
             "takes it for a single pair."
         )
     return without_curve(weights)
-
-
-def identify_pairs(
-    tracks: Mapping[str, PoseTrack], families: FamilyChoice, progress: Callable[[int, int], object] | None
-) -> dict[frozenset[str], PartPair]:
-    """Identify the joints between all pairs of parts that were observed together."""
-    names, report = list(combinations(tracks, 2)), progress or (lambda done, count: None)
-    result: dict[frozenset[str], PartPair] = {}
-    for done, (a, b) in enumerate(names):
-        report(done, len(names))
-        if (pair := identify_pair(tracks, a, b, families)) is not None:
-            result[frozenset((a, b))] = pair
-    report(len(names), len(names))
-    return result
