@@ -55,7 +55,7 @@ def test_linear_model_with_measured_speeds_equals_a_kalman_filter():
         assert estimate.nis == pytest.approx(nis)
 
 
-def drive(tracker, seconds, *, poses, odometry=False, slip=None, seed=0, dt=1 / 30):
+def drive(tracker, seconds, *, poses, odometry=False, slip=None, seed=0, dt=0.1):
     """Return errors of the position of a base on a circle [m], and the last estimate."""
     rng, errors = np.random.default_rng(seed), []
     for k in range(round(seconds / dt)):
@@ -74,7 +74,7 @@ def drive(tracker, seconds, *, poses, odometry=False, slip=None, seed=0, dt=1 / 
     return np.array(errors), estimate
 
 
-def observe_base(**options):
+def observe_base(*, has_odometry=True, **options):
     model = make_body(wheels=True)
     left, right = model.speeds
     speed = kv.array([0.05 * (left + right), 0.25 * (right - left)])
@@ -83,29 +83,31 @@ def observe_base(**options):
         ObservedExpression("odometry", speed, np.diag([0.02, 0.01]) ** 2),
     ]
     start = dict.fromkeys(("b/x", "b/y", "b/angle"), 0.0)
+    observed = observed if has_odometry else observed[:1]
     return Tracker(model, observed, start=start, uncertainty=dict.fromkeys(start, 0.05), **options)
 
 
 def test_wheel_odometry_bridges_rare_poses():
-    errors, estimate = drive(observe_base(outliers=True), 6.0, poses=lambda k: k % 60 == 0, odometry=True)
-    blind, _ = drive(observe_base(outliers=True), 6.0, poses=lambda k: k % 60 == 0)
-    assert np.sqrt(np.mean(errors[60:] ** 2)) < 0.02
-    assert np.sqrt(np.mean(blind[60:] ** 2)) > 0.1
+    errors, estimate = drive(observe_base(outliers=True), 6.0, poses=lambda k: k % 20 == 0, odometry=True)
+    blind, _ = drive(observe_base(outliers=True), 6.0, poses=lambda k: k % 20 == 0)
+    assert np.sqrt(np.mean(errors[20:] ** 2)) < 0.02
+    assert np.sqrt(np.mean(blind[20:] ** 2)) > 0.1
     assert estimate.residuals["odometry"].nis < 14
 
 
 def test_slipping_wheels_are_outliers():
     errors, estimate = drive(
-        observe_base(outliers=True), 4.0, poses=lambda k: True, odometry=True, slip=lambda k: k >= 90
+        observe_base(outliers=True), 4.0, poses=lambda k: True, odometry=True, slip=lambda k: k >= 30
     )
     assert estimate.outliers == ("odometry",)
-    assert errors[30:].max() < 0.02
+    assert errors[10:].max() < 0.02
 
 
 def test_a_base_is_followed_by_default():
     """With the default process, an outlier model and a start that is known to 5 cm."""
-    errors, estimate = drive(observe_base(outliers=True), 6.0, poses=lambda k: True)
-    assert np.sqrt(np.mean(errors[30:] ** 2)) < 0.008
+    tracker = observe_base(has_odometry=False, outliers=True)
+    errors, estimate = drive(tracker, 6.0, poses=lambda k: True)
+    assert np.sqrt(np.mean(errors[10:] ** 2)) < 0.008
     assert not estimate.lost
 
 
@@ -145,8 +147,8 @@ def test_parts_that_move_against_each_other_are_followed():
     observer = NoisyObserver(model, ["C"], 0.005, 0.02)
     tracker = Tracker(model, [ObservedPose("C", covariance=observer.covariance)], outliers=True)
     errors = []
-    for k in range(150):
-        share = np.clip((k - 30) / 60, 0, 1)
+    for k in range(100):
+        share = np.clip((k - 20) / 60, 0, 1)
         angle = 1.5 * share**3 * (10 - 15 * share + 6 * share**2)
         estimate = tracker.update(observer({"a": angle, "c": -2 * angle}), at=k / 30)
         errors.append(abs(estimate.state["c"] + 2 * angle))
@@ -171,7 +173,7 @@ def test_a_redundant_arm_in_motion_states_no_more_than_it_knows(count):
     for seed in range(count):
         rng, tracker, u = np.random.default_rng(seed), first.copy(), np.zeros(7)
         x = np.array(list(BENT.values())) + 0.2 * rng.standard_normal(7)
-        for k in range(60):
+        for k in range(40):
             if k:
                 change = np.sqrt(0.01 * 0.1) * rng.standard_normal(7)
                 x, u = x + 0.1 * (u + change / 2), u + change
