@@ -286,7 +286,10 @@ def _unjustified(
     evidence = {family: p / prior[family] for family, p in result.probabilities.items()}
     for rival in sorted(rivals, key=evidence.__getitem__, reverse=True)[:1]:
         if evidence[motion.name] < odds * evidence[rival]:
-            yield f"{rival} explains the observations as well, and is only rarer"
+            yield (
+                f"{rival} explains the observations as well, and is only rarer; "
+                "if it cannot be one, leave it out of the families"
+            )
 
 
 def _is_explained(curve: FamilySolution, solutions: FamilySolutions) -> bool:
