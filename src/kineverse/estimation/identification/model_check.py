@@ -276,6 +276,8 @@ def _unjustified(
     motion, (size, turn) = solutions[name].scored.solution.motion, solutions[name].noise.factors
     if not data.stated and max(size, turn) > (_STRANGE if motion.joints > 1 else _LARGE):
         yield "the noise would be very large, so it may be a motion: state the noise"
+    if data.stated and motion.rows == 6:
+        return  # a stated noise and orientations bound the evidence of all families
     # From positions a tilt of the axis may stand for a pitch, so they have to exclude others by themselves.
     odds, rivals = SURE / (1.0 - SURE), result.probabilities.keys() - {motion.name}
     if motion.rows == 6:
