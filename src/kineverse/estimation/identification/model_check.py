@@ -277,6 +277,8 @@ def _unjustified(
     largest = _LARGE if motion.name in ("rigid", "prismatic", "revolute") else _STRANGE
     if not data.stated and (max(size, turn) > largest or min(size, turn) > _STRANGE):
         yield "the noise would be very large, so it may be a motion: state the noise"
+    if data.stated and motion.rows == 6:
+        return  # a stated noise and orientations bound the evidence of all families
     # From positions a tilt of the axis may stand for a pitch, so they have to exclude others by themselves.
     odds, rivals = SURE / (1.0 - SURE), result.probabilities.keys() - {motion.name}
     if motion.rows == 6:
