@@ -80,7 +80,7 @@ def log_evidence(served: KnownJoint, residuals: KnownResiduals, is_static: bool 
     excess = np.nansum(residuals.disagreement**2, axis=0) - np.isfinite(residuals.disagreement).sum(axis=0)
     log -= 0.5 * float(np.maximum(excess, 0.0).sum())
     widths = _STATIC_WIDTH if is_static else _WIDTHS
-    if served.joints == 1:
+    if len(served.lower) == 1:
         lower, upper = float(served.lower[0]), float(served.upper[0])
         density = float(_log_density(served)[0])
         values, variances = residuals.values[:, 0], residuals.covariances[:, 0, 0]
@@ -104,8 +104,8 @@ def log_displacement_gain(residuals: KnownResiduals, covariances: Iterable[Array
 
 def _log_evidence_of_several(served: KnownJoint, residuals: KnownResiduals, widths: Array) -> float:
     """Return log ∫ Π_k ∫ N(â_k; a, C_k) p(a; μ, s) da dμ at the best widths s, on average."""
-    best, log = np.zeros(served.joints), 0.0
-    for j in range(served.joints):
+    best, log = np.zeros(len(served.lower)), 0.0
+    for j in range(len(best)):
         variances = residuals.covariances[:, j, j]
         logs = _log_evidence_by_width(residuals.values[:, j], variances, -math.inf, math.inf, widths, 0.0)
         best[j] = widths[int(np.argmax(logs))]
@@ -311,9 +311,7 @@ def _propose_replacement(
     try:
         used = np.searchsorted(data.times, recent.times)
         rows, fit = extend_fit(alternative.best, data.observations, used)
-        coordinates = data.served.solve_unbounded(data.observations, data.residuals.coordinates)[rows]
-        others = data.residuals.other_values[rows]
-        operation = build_replacement(model, data.joint, data.served, coordinates, others, fit)
+        operation = build_replacement(model, data.joint, data.served, data.residuals.select(rows), fit)
     except KineverseError as error:
         return None, f"its replacement is no operation. {error}"
     try:

@@ -37,7 +37,7 @@ from kineverse.model.read_recorder import ReadRecorder
 from kineverse.symbols import Symbol
 
 from .report import TestableJoint
-from .residuals import KnownJoint
+from .residuals import KnownJoint, KnownResiduals
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ def find_joint_value(
     model: Model, joint: TestableJoint, served: KnownJoint, records: Mapping[str, Articulation]
 ) -> JointValue | None:
     """Return the value of a joint; None if it has several degrees of freedom."""
-    if served.joints != 1 or len(served.coordinates) != 1:
+    if len(served.coordinates) != 1:
         return None
     (coordinate,) = served.coordinates
     position = next((record.position for record in records.values()), None)
@@ -122,7 +122,7 @@ class ReplacedJoint(Operation, document_kind="Relearned"):
 
 
 def build_replacement(
-    model: Model, joint: TestableJoint, served: KnownJoint, coordinates: Array, others: Array, fit: Fit
+    model: Model, joint: TestableJoint, served: KnownJoint, residuals: KnownResiduals, fit: Fit
 ) -> Operation:
     """Build the operation that replaces a joint."""
     base_T_parent = _constant(model, joint.parent, joint.base)
@@ -142,6 +142,7 @@ def build_replacement(
     if motion.joints == 1 and before is not None:
         turns = motion.parametrisation.joints[0] >= WX
         same_kind = bool(served.is_angle[0]) == turns
+        coordinates, others = residuals.values, residuals.other_values
         if same_kind and turns and not before.is_derived:
             coordinates = coordinates + _turn_about_axis(served, coordinates, motion, values)
         known = others[:, 0] if others.shape[1] else coordinates[:, 0]
