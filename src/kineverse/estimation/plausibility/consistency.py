@@ -11,7 +11,7 @@ is ignored.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
@@ -30,18 +30,10 @@ from kineverse.model.rates import to_plain
 from kineverse.symbols import Symbol
 
 from .report import TestableJoint
-from .residuals import KnownJoint, KnownResiduals, compute_residuals, is_own_limit
+from .residuals import JointObservations, KnownJoint, KnownResiduals, compute_residuals, is_own_limit
 
 # Range of the linearity test in standard deviations, and the accepted relative nonlinearity.
 _RANGE, _NONLINEAR = 2.0, 0.5
-
-
-@dataclass(frozen=True)
-class TimedResiduals:
-    """Residuals of one joint, with the numbers of their observations."""
-
-    times: npt.NDArray[np.int_]  # numbers of the observations, (N,)
-    residuals: KnownResiduals
 
 
 _COMPARED = 50  # number of observations by which exchanged frames are recognised
@@ -99,25 +91,27 @@ class ConsistencyTests:
             return False
         return self._shared_coordinates(joint) == other._shared_coordinates(joint)
 
-    def apply(self, residuals: Mapping[TestableJoint, TimedResiduals]) -> dict[TestableJoint, KnownResiduals]:
-        """Return the residuals of each joint with the results of the tests added."""
-        return {joint: self._apply_to(joint, residuals) for joint in residuals}
+    def apply(
+        self, data: Mapping[TestableJoint, JointObservations]
+    ) -> dict[TestableJoint, JointObservations]:
+        """Return the observations of each joint with the results of the tests added to their residuals."""
+        return {joint: replace(each, residuals=self._apply_to(joint, data)) for joint, each in data.items()}
 
     def _shared_coordinates(self, joint: TestableJoint) -> tuple[Symbol, ...]:
         served = self._served_joints[joint]
         return tuple(x for x in served.coordinates if served.is_plain and self._sources[x] != joint)
 
     def _apply_to(
-        self, joint: TestableJoint, residuals: Mapping[TestableJoint, TimedResiduals]
+        self, joint: TestableJoint, data: Mapping[TestableJoint, JointObservations]
     ) -> KnownResiduals:
-        served, limits, mine = self._served_joints[joint], self._limits[joint], residuals[joint]
+        served, limits, mine = self._served_joints[joint], self._limits[joint], data[joint]
         shared_coordinates = self._shared_coordinates(joint)
         if not limits.slacks and not shared_coordinates:
             return mine.residuals
         others = list(dict.fromkeys([*limits.others, *shared_coordinates]))
-        values, covariances, shared = self._find_other_values(joint, others, mine.times, residuals)
+        values, covariances, shared = self._find_other_values(joint, others, mine.numbers, data)
         excess = limits.excess(served, mine.residuals, values, covariances, shared)
-        disagreement = np.zeros((len(mine.times), len(shared_coordinates)))
+        disagreement = np.zeros((len(mine.numbers), len(shared_coordinates)))
         for j, x in enumerate(shared_coordinates):
             k, other = served.coordinates.index(x), others.index(x)
             elsewhere = values[:, other], covariances[:, other, other]
@@ -132,7 +126,7 @@ class ConsistencyTests:
         joint: TestableJoint,
         others: Sequence[Symbol],
         when: npt.NDArray[np.int_],
-        residuals: Mapping[TestableJoint, TimedResiduals],
+        data: Mapping[TestableJoint, JointObservations],
     ) -> tuple[Array, Array, npt.NDArray[np.bool_]]:
         """Return values (N, m), covariances and shared frames of other coordinates; NaN where unknown."""
         values = np.full((len(when), len(others)), np.nan)
@@ -141,11 +135,11 @@ class ConsistencyTests:
         for source in {self._sources[x] for x in others}:
             at = np.array([j for j, x in enumerate(others) if self._sources[x] == source])
             shared[at] = bool(self._frames[source] & self._frames[joint])
-            if source not in residuals:
+            if source not in data:
                 continue
             columns = np.array([self._served_joints[source].coordinates.index(others[j]) for j in at])
-            known = residuals[source]
-            _, mine, theirs = np.intersect1d(when, known.times, return_indices=True)
+            known = data[source]
+            _, mine, theirs = np.intersect1d(when, known.numbers, return_indices=True)
             values[np.ix_(mine, at)] = known.residuals.values[np.ix_(theirs, columns)]
             covariances[np.ix_(mine, at, at)] = known.residuals.covariances[np.ix_(theirs, columns, columns)]
         return values, covariances, shared

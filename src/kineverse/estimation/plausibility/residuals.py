@@ -31,6 +31,8 @@ from kineverse.model.model import Model
 from kineverse.model.rates import to_plain
 from kineverse.symbols import Symbol
 
+from .report import TestableJoint
+
 # Number of initial values of a single coordinate, and of several coordinates.
 _GRID_SIZE, _SAMPLE_SIZE = 33, 256
 _MARGIN = 1e-6  # relative margin to limits, where slopes may be infinite
@@ -238,7 +240,7 @@ class KnownResiduals:
     def __len__(self) -> int:
         return len(self.orthogonal)
 
-    @property
+    @cached_property
     def one_sided(self) -> Array:
         """All one-sided test quantities, in standard deviations, (N, 2 k + c + 2 e)."""
         parts = (self.bound_excess, self.limit_excess, self.disagreement, -self.disagreement)
@@ -308,3 +310,36 @@ def _whiten(solution: Solution[Any], by_joints: Array) -> tuple[Array, Array, Ar
     whitening = np.linalg.inv(np.linalg.cholesky(solution.covariance))
     error = (whitening @ solution.residuals[:, :, None])[:, :, 0]
     return whitening, error, whitening @ by_joints
+
+
+_KEPT = 60  # least number of observations that are kept of correlated ones, if there are as many
+
+
+@dataclass(frozen=True)
+class JointObservations:
+    """Observations of a tested joint, and their residuals."""
+
+    joint: TestableJoint
+    served: KnownJoint
+    observations: Observations  # of both frames
+    residuals: KnownResiduals
+    numbers: npt.NDArray[np.int_]  # numbers and times [s] of the observations, (N,)
+    stamps: Array
+    displacement: Array | None = None  # covariance (12, 12) of a joint that is not known exactly
+
+    def select(self, rows: slice | npt.NDArray[np.int_]) -> Self:
+        """Return some of the observations."""
+        poses, residuals = self.observations.select(rows), self.residuals.select(rows)
+        numbers, stamps = self.numbers[rows], self.stamps[rows]
+        return replace(self, observations=poses, residuals=residuals, numbers=numbers, stamps=stamps)
+
+    def decorrelate(self, looks: float) -> Self:
+        """Return evenly spaced observations with larger covariances, as independent ones."""
+        count = len(self.numbers)
+        kept = min(max(math.ceil(count / looks), _KEPT), count)
+        factor = max(looks * kept / count, 1.0)
+        result = self if kept == count else self.select(np.linspace(0, count - 1, kept).round().astype(int))
+        if factor == 1.0:
+            return result
+        poses, residuals = result.observations.scaled(factor), result.residuals.scaled(factor)
+        return replace(result, observations=poses, residuals=residuals)
