@@ -25,7 +25,13 @@ from kineverse.estimation.identification.kinematic_graph.pairwise import (
     identify_observations,
 )
 from kineverse.estimation.identification.outlier_rejection import RowIndices, is_inlier
-from kineverse.estimation.identification.result import SURE, Fit, IdentificationResult, project_observations
+from kineverse.estimation.identification.result import (
+    SURE,
+    Fit,
+    IdentificationResult,
+    complete_fit,
+    project_observations,
+)
 from kineverse.estimation.linear_algebra import (
     invert_matrices,
     log_determinants,
@@ -37,7 +43,7 @@ from kineverse.lie import Array
 from kineverse.model.model import Model
 from kineverse.model.operation import Operation
 
-from .replacement import build_replacement, extend_fit, follows_another
+from .replacement import build_replacement, follows_another
 from .report import JointVerdict, TestableJoint
 from .residuals import (
     SIZES,
@@ -303,9 +309,10 @@ def _propose_replacement(
         # Another joint would not resolve the contradiction.
         return None, "it explains the poses alone, but not together with the limits or joints it depends on"
     try:
+        # The observations before that the new joint explains show its range, too.
         used = np.searchsorted(data.numbers, recent.numbers)
-        rows, fit = extend_fit(alternative.best, data.observations, used)
-        operation = build_replacement(model, data.joint, data.served, data.residuals.select(rows), fit)
+        fit = complete_fit(alternative.best, data.observations, used, Outliers())
+        operation = build_replacement(model, data, fit)
     except KineverseError as error:
         return None, f"its replacement is no operation. {error}"
     try:

@@ -13,6 +13,7 @@ import numpy.typing as npt
 
 from kineverse.errors import InvalidValueError, KineverseError, ShapeError, UnknownNameError, suggest
 from kineverse.estimation.correlation import CorrelationSettings, ErrorCorrelation
+from kineverse.estimation.identification import native
 from kineverse.estimation.identification.kinematic_graph.pairwise import FamilyChoice
 from kineverse.estimation.identification.observations import (
     PosesLike,
@@ -37,7 +38,6 @@ from .e_process import SequentialTest
 from .report import JointVerdict, Plausibility, TestableJoint, find_testable_joints
 from .residuals import JointObservations, KnownJoint, compute_residuals
 
-_OBSERVED, _EYE_3 = np.ones(1, dtype=bool), np.eye(3)
 FALSE_ALARMS = 1e-3  # default probability of rejecting a joint that is as served
 
 
@@ -284,12 +284,12 @@ class PlausibilityMonitor:
         correlation = CorrelationSettings(decorrelation_time, False)
         self._settings = TestSettings(false_alarms, as_outliers(outliers), relative_to, families, correlation)
         self._noise = noise
-        self._covariances: Array | None = None  # checked covariance of a pose without its own, (1, 6, 6)
         self._last: float | None = None
         self._recent: deque[dict[str, PoseTrack]] = deque(maxlen=keep)
         self._stamps: deque[float] = deque(maxlen=keep)
         self._repairs = {verdict.tag: verdict for verdict in repaired if verdict.replacement is not None}
         self._tests: dict[TestableJoint, _OnlineTest] = {}
+        native.prepare()
         self._version = model.version
         self._tested = _TestedModel(model, self.frames, self._settings, self._repairs.values())
 
@@ -379,14 +379,8 @@ class PlausibilityMonitor:
         matrix = as_numbers(pose, f"The pose of '{name}'")
         if matrix.shape != (4, 4):
             raise ShapeError(f"The pose of '{name}' is a 4×4 transform, not of shape {matrix.shape}.")
-        if not covariance and self._covariances is not None and _is_certainly_rigid(matrix):
-            # The usual case in a fraction of the time.
-            return PoseTrack(matrix[None].copy(), self._covariances, _OBSERVED)
         given: PosesLike = (matrix[None], covariance[0]) if covariance else matrix[None]
-        track = check_tracks({name: given}, self._noise)[name]
-        if not covariance:
-            self._covariances = track.covariances
-        return track
+        return check_tracks({name: given}, self._noise)[name]
 
     def _next_time(self, at: float | None) -> float:
         if self._last is not None and (at is not None) != self._settings.correlation.stamped:
@@ -404,14 +398,3 @@ class _OnlineTest(NamedTuple):
     test: SequentialTest
     errors: ErrorCorrelation
     begun: int  # number of the first observation
-
-
-def _is_certainly_rigid(pose: Array) -> bool:
-    """Return True for a pose (4, 4) that needs no further check."""
-    rotation = pose[:3, :3]
-    return (
-        bool(np.abs(rotation.T @ rotation - _EYE_3).max() < 1e-6)
-        and float(np.linalg.det(rotation)) > 0.0
-        and pose[3].tolist() == [0.0, 0.0, 0.0, 1.0]
-        and bool(np.abs(pose[:3, 3]).max() < 1e6)
-    )
