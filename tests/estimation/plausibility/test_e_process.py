@@ -45,14 +45,15 @@ def test_false_alarm_rate_is_bounded(resting: KnownResiduals, wrong: float, stat
 
     # Outliers are constant, which looks most like a change of the joint.
     corrupt = np.random.default_rng(9).uniform(size=RUNS * LONG) < wrong
-    normal = np.where(corrupt[:, None], 40.0, left.orthogonal)
-    beyond = np.where(corrupt[:, None], 40.0, left.bound_excess)
+    wrong_by = {
+        name: np.where(corrupt[:, None], 40.0, getattr(left, name)) for name in ("orthogonal", "bound_excess")
+    }
+    left = replace(left, **wrong_by)
     stated, alarms = 0.2, 0
     for run in range(RUNS):
         test = SequentialTest(stated, stated_wrong)
         for k in range(run * LONG, (run + 1) * LONG):
-            test.add(normal[k], left.displacement_jacobian[k], beyond[k])
-            test.count_outlier(normal[k], left.displacement_jacobian[k])
+            test.observe(left, k, k, 1.0)
         alarms += test.implausible_since is not None
     assert alarms <= stats.binom(RUNS, stated).ppf(0.99)
 

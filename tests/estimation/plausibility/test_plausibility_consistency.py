@@ -12,10 +12,15 @@ from observed_frames import NOISE, observe_frames
 import kineverse as kv
 from kineverse.estimation import Plausibility, PlausibilityMonitor, check_plausibility
 from kineverse.estimation.identification.observations import check_tracks, exact_track, pair_tracks
-from kineverse.estimation.plausibility.consistency import ConsistencyTests, TimedResiduals
+from kineverse.estimation.plausibility.consistency import ConsistencyTests
 from kineverse.estimation.plausibility.e_process import SequentialTest
 from kineverse.estimation.plausibility.report import find_testable_joints
-from kineverse.estimation.plausibility.residuals import KnownJoint, KnownResiduals, compute_residuals
+from kineverse.estimation.plausibility.residuals import (
+    JointObservations,
+    KnownJoint,
+    KnownResiduals,
+    compute_residuals,
+)
 
 Array = npt.NDArray[np.float64]
 SOME = ("rigid", "prismatic", "revolute", "free")
@@ -54,10 +59,10 @@ def add_consistency(model: kv.Model, observations: dict[str, Array]) -> dict[str
     each = {}
     for joint, served in judged.items():
         times = np.flatnonzero(known[joint.parent].observed & known[joint.child].observed)
-        each[joint] = TimedResiduals(
-            times, compute_residuals(served, pair_tracks(known[joint.parent], known[joint.child], times))
-        )
-    return {joint.tag: left for joint, left in ConsistencyTests(model, judged, "world").apply(each).items()}
+        poses = pair_tracks(known[joint.parent], known[joint.child], times)
+        each[joint] = JointObservations(joint, served, poses, compute_residuals(served, poses), times, times)
+    tested = ConsistencyTests(model, judged, "world").apply(each)
+    return {joint.tag: data.residuals for joint, data in tested.items()}
 
 
 def is_standard_normal(z: Array) -> bool:

@@ -15,18 +15,23 @@ from dataclasses import dataclass, replace
 from types import MappingProxyType
 
 import numpy as np
-import numpy.typing as npt
 
-from kineverse.errors import KineverseError
+from kineverse._checks import as_tolerance
+from kineverse.errors import InvalidValueError, KineverseError
 from kineverse.estimation.correlation import CorrelationSettings
 from kineverse.estimation.identification.kinematic_graph.pairwise import (
     LOG_ANYWHERE,
     FamilyChoice,
     identify_observations,
 )
-from kineverse.estimation.identification.observations import Observations
 from kineverse.estimation.identification.outlier_rejection import RowIndices, is_inlier
-from kineverse.estimation.identification.result import SURE, Fit, IdentificationResult, project_observations
+from kineverse.estimation.identification.result import (
+    SURE,
+    Fit,
+    IdentificationResult,
+    complete_fit,
+    project_observations,
+)
 from kineverse.estimation.linear_algebra import (
     invert_matrices,
     log_determinants,
@@ -38,11 +43,11 @@ from kineverse.lie import Array
 from kineverse.model.model import Model
 from kineverse.model.operation import Operation
 
-from .consistency import TimedResiduals
-from .replacement import build_replacement, extend_fit, follows_another
+from .replacement import build_replacement, follows_another
 from .report import JointVerdict, TestableJoint
 from .residuals import (
     SIZES,
+    JointObservations,
     KnownJoint,
     KnownResiduals,
     compute_residuals,
@@ -80,7 +85,7 @@ def log_evidence(served: KnownJoint, residuals: KnownResiduals, is_static: bool 
     excess = np.nansum(residuals.disagreement**2, axis=0) - np.isfinite(residuals.disagreement).sum(axis=0)
     log -= 0.5 * float(np.maximum(excess, 0.0).sum())
     widths = _STATIC_WIDTH if is_static else _WIDTHS
-    if served.joints == 1:
+    if len(served.lower) == 1:
         lower, upper = float(served.lower[0]), float(served.upper[0])
         density = float(_log_density(served)[0])
         values, variances = residuals.values[:, 0], residuals.covariances[:, 0, 0]
@@ -104,8 +109,8 @@ def log_displacement_gain(residuals: KnownResiduals, covariances: Iterable[Array
 
 def _log_evidence_of_several(served: KnownJoint, residuals: KnownResiduals, widths: Array) -> float:
     """Return log ∫ Π_k ∫ N(â_k; a, C_k) p(a; μ, s) da dμ at the best widths s, on average."""
-    best, log = np.zeros(served.joints), 0.0
-    for j in range(served.joints):
+    best, log = np.zeros(len(served.lower)), 0.0
+    for j in range(len(best)):
         variances = residuals.covariances[:, j, j]
         logs = _log_evidence_by_width(residuals.values[:, j], variances, -math.inf, math.inf, widths, 0.0)
         best[j] = widths[int(np.argmax(logs))]
@@ -161,56 +166,51 @@ PRIOR: Mapping[str, float] = MappingProxyType({"served": 0.8, "elsewhere": 0.05,
 """Prior probabilities: joint as served, joint or child displaced, rigid, another joint."""
 
 _LEAST_COUNT = 5  # least number of observations for a statement about the motion
-_KEPT = 60  # least number of observations that are kept of correlated ones, if there are as many
 _UNRELATED = 0.5  # ratio of successive to other distances from which on poses are unrelated
 _LEAST_INDEPENDENT = 1.5  # least number of independent observations for a certain verdict
 _CORRELATED = 2.0  # number of looks that are worth one, from which on this is worth saying
-_ALMOST_ONE = 1.1  # factor on covariances that changes no verdict
 
 
 @dataclass(frozen=True)
-class JointObservations(TimedResiduals):
-    """Observations of a tested joint."""
+class TestSettings:
+    """Settings of the tests of all joints."""
 
-    joint: TestableJoint
-    served: KnownJoint  # motion in the served model
-    observations: Observations  # of both frames
-    stamps: Array  # their times [s], (N,)
-    displacement: Array | None = None  # covariance (12, 12) of a joint that is not known exactly
+    false_alarms: float
+    outliers: Outliers | None
+    relative_to: str | None
+    families: FamilyChoice
+    correlation: CorrelationSettings
 
-    def select(self, rows: slice | npt.NDArray[np.int_]) -> JointObservations:
-        """Return some of the observations."""
-        poses, residuals = self.observations.select(rows), self.residuals.select(rows)
-        times, stamps = self.times[rows], self.stamps[rows]
-        return replace(self, times=times, stamps=stamps, observations=poses, residuals=residuals)
+    def __post_init__(self) -> None:
+        if not 0.0 < self.false_alarms < 1.0:
+            raise InvalidValueError(
+                f"The probability of a false alarm is between 0 and 1, not {self.false_alarms}."
+            )
+        if self.correlation.time is not None:
+            as_tolerance(self.correlation.time, "The decorrelation time [s]")
 
-    def decorrelate(self, looks: float) -> JointObservations:
-        """Return evenly spaced observations with larger covariances, as independent ones."""
-        count = len(self.times)
-        kept = min(max(math.ceil(count / looks), _KEPT), count)
-        factor = max(looks * kept / count, 1.0)
-        result = self if kept == count else self.select(np.linspace(0, count - 1, kept).round().astype(int))
-        if factor < _ALMOST_ONE:
-            return result
-        poses, residuals = result.observations.scaled(factor), result.residuals.scaled(factor)
-        return replace(result, observations=poses, residuals=residuals)
+    def pair_outliers(self, joint: TestableJoint) -> Outliers | None:
+        """Return the outlier model of a pair of poses: an outlier of either is one of the pair."""
+        if self.outliers is None or joint.parent == self.relative_to:
+            return self.outliers
+        return replace(self.outliers, fraction=1.0 - (1.0 - self.outliers.fraction) ** 2)
 
 
 def judge_joint(
-    model: Model,
-    data: JointObservations,
-    implausible_since: int | None,
-    families: FamilyChoice,
-    outliers: Outliers | None,
-    correlation: CorrelationSettings,
+    model: Model, data: JointObservations, implausible_since: int | None, settings: TestSettings
 ) -> JointVerdict:
     """Compare a joint with its alternatives, given the change point of the sequential test."""
+    families, correlation, outliers = (
+        settings.families,
+        settings.correlation,
+        settings.pair_outliers(data.joint),
+    )
     if implausible_since is None:
         recent = data
         rows = reject_outliers(data.residuals, outliers)
     else:
-        recent = data.select(slice(int(np.searchsorted(data.times, implausible_since)), None))
-        rows = np.arange(len(recent.times))
+        recent = data.select(slice(int(np.searchsorted(data.numbers, implausible_since)), None))
+        rows = np.arange(len(recent.numbers))
         if outliers is not None and len(rows) >= 2:
             rows = identify_observations(recent.observations, families, outliers).best.inliers
     inliers = recent.select(rows)
@@ -243,8 +243,8 @@ def judge_joint(
         reason = _ambiguity_reason(probabilities, len(rows), looks)
     squares = np.mean(inliers.residuals.pose_residuals**2, axis=0)
     rms = math.sqrt(float(squares[:3].sum())), math.sqrt(float(squares[3:].sum()))
-    left_out = tuple(np.setdiff1d(recent.times, inliers.times).tolist())
-    verdict = JointVerdict(data.joint, probabilities, rms, len(data.times), implausible_since, alternative)
+    left_out = tuple(np.setdiff1d(recent.numbers, inliers.numbers).tolist())
+    verdict = JointVerdict(data.joint, probabilities, rms, len(data.numbers), implausible_since, alternative)
     return replace(verdict, replacement=operation, reason=reason, outliers=left_out)
 
 
@@ -296,7 +296,7 @@ def _ambiguity_reason(probabilities: Mapping[str, float], count: int, looks: flo
 def _propose_replacement(
     model: Model, data: JointObservations, recent: JointObservations, alternative: IdentificationResult | None
 ) -> tuple[Operation | None, str]:
-    if alternative is None or len(recent.times) < _LEAST_COUNT:
+    if alternative is None or len(recent.numbers) < _LEAST_COUNT:
         return None, "there are too few observations since for a replacement"
     if alternative.best.family == "free":
         return None, "no joint explains the poses since; the part is loose, or errors are larger than stated"
@@ -309,11 +309,10 @@ def _propose_replacement(
         # Another joint would not resolve the contradiction.
         return None, "it explains the poses alone, but not together with the limits or joints it depends on"
     try:
-        used = np.searchsorted(data.times, recent.times)
-        rows, fit = extend_fit(alternative.best, data.observations, used)
-        coordinates = data.served.solve_unbounded(data.observations, data.residuals.coordinates)[rows]
-        others = data.residuals.other_values[rows]
-        operation = build_replacement(model, data.joint, data.served, coordinates, others, fit)
+        # The observations before that the new joint explains show its range, too.
+        used = np.searchsorted(data.numbers, recent.numbers)
+        fit = complete_fit(alternative.best, data.observations, used, Outliers())
+        operation = build_replacement(model, data, fit)
     except KineverseError as error:
         return None, f"its replacement is no operation. {error}"
     try:

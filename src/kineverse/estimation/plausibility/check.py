@@ -5,14 +5,15 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from kineverse._checks import as_tolerance
 from kineverse.errors import InvalidValueError, KineverseError, ShapeError, UnknownNameError, suggest
-from kineverse.estimation.correlation import CorrelationSettings
+from kineverse.estimation.correlation import CorrelationSettings, ErrorCorrelation
+from kineverse.estimation.identification import native
 from kineverse.estimation.identification.kinematic_graph.pairwise import FamilyChoice
 from kineverse.estimation.identification.observations import (
     PosesLike,
@@ -31,13 +32,12 @@ from kineverse.lie import Array
 from kineverse.model.frame import WORLD
 from kineverse.model.model import Model, Snapshot
 
-from .alternatives import JointObservations, displacement_covariance, judge_joint
+from .alternatives import TestSettings, displacement_covariance, judge_joint
 from .consistency import ConsistencyTests, find_exchanged_frames
-from .e_process import CorrelatedTest, SequentialTest
+from .e_process import SequentialTest
 from .report import JointVerdict, Plausibility, TestableJoint, find_testable_joints
-from .residuals import KnownJoint, compute_residuals
+from .residuals import JointObservations, KnownJoint, compute_residuals
 
-_OBSERVED, _EYE_3 = np.ones(1, dtype=bool), np.eye(3)
 FALSE_ALARMS = 1e-3  # default probability of rejecting a joint that is as served
 
 
@@ -108,9 +108,8 @@ def check_plausibility(
         pairs = {name: (recent.poses[name], noise) for name, noise in recent.covariances.items()}
         observations, times, relative_to = {**recent.poses, **pairs}, recent.times, recent.relative_to
     observations = {} if observations is None else observations
-    settings = _TestSettings(
-        false_alarms, as_outliers(outliers), relative_to, families, decorrelation_time, times is not None
-    )
+    correlation = CorrelationSettings(decorrelation_time, times is not None)
+    settings = TestSettings(false_alarms, as_outliers(outliers), relative_to, families, correlation)
     tracks = check_tracks(observations, noise)
     count = max((len(track.poses) for track in tracks.values()), default=0)
     stamps = _check_times(times, count)
@@ -124,36 +123,6 @@ def check_plausibility(
     return result
 
 
-@dataclass(frozen=True)
-class _TestSettings:
-    """Settings of the tests of all joints."""
-
-    false_alarms: float
-    outliers: Outliers | None
-    relative_to: str | None
-    families: FamilyChoice
-    decorrelation_time: float | None
-    stamped: bool = False  # True if the observations have times
-
-    def __post_init__(self) -> None:
-        if not 0.0 < self.false_alarms < 1.0:
-            raise InvalidValueError(
-                f"The probability of a false alarm is between 0 and 1, not {self.false_alarms}."
-            )
-        if self.decorrelation_time is not None:
-            as_tolerance(self.decorrelation_time, "The decorrelation time [s]")
-
-    @property
-    def correlation(self) -> CorrelationSettings:
-        return CorrelationSettings(self.decorrelation_time, self.stamped)
-
-    def pair_outliers(self, joint: TestableJoint) -> Outliers | None:
-        """Return the outlier model of a pair of poses: an outlier of either is one of the pair."""
-        if self.outliers is None or joint.parent == self.relative_to:
-            return self.outliers
-        return replace(self.outliers, fraction=1.0 - (1.0 - self.outliers.fraction) ** 2)
-
-
 class _TestedModel:
     """Testable joints of one version of a model."""
 
@@ -161,7 +130,7 @@ class _TestedModel:
         self,
         model: Model,
         frames: Iterable[str],
-        settings: _TestSettings,
+        settings: TestSettings,
         repaired: Iterable[JointVerdict] = (),
     ) -> None:
         self.model, self.settings = model, settings
@@ -216,15 +185,9 @@ class _TestedModel:
             except KineverseError as error:
                 self._reasons[joint] = f"its pose cannot be computed. {error}"
                 continue
-            known = self._known.get(joint)
-            data[joint] = JointObservations(
-                rows + first, residuals, joint, served, poses, stamps[rows], known
-            )
-        tested = self.consistency.apply(data)
-        for joint, each in data.items():
-            if tested[joint] is not each.residuals:
-                data[joint] = replace(each, residuals=tested[joint])
-        return data
+            when = rows + first, stamps[rows], self._known.get(joint)
+            data[joint] = JointObservations(joint, served, poses, residuals, *when)
+        return self.consistency.apply(data)
 
     def begin_test(self, data: JointObservations) -> SequentialTest:
         """Return a new test of a joint."""
@@ -237,12 +200,9 @@ class _TestedModel:
         residuals, test = data.residuals, self.begin_test(data)
         size = residuals.orthogonal.shape[1]
         looks = self.settings.correlation.measure(residuals.whitened, size, data.stamps)
-        for row in zip(
-            residuals.orthogonal, residuals.displacement_jacobian, residuals.one_sided, strict=True
-        ):
-            test.add(*row, looks)
-            test.count_outlier(*row[:2])
-        return None if test.implausible_since is None else int(data.times[test.implausible_since])
+        for row, number in enumerate(data.numbers.tolist()):
+            test.observe(residuals, row, number, looks)
+        return test.implausible_since
 
     def report(
         self,
@@ -252,57 +212,38 @@ class _TestedModel:
         first: int = 0,
     ) -> Plausibility:
         """Return the verdicts on all joints, given the first observations that they do not explain."""
-        settings = self.settings
         rejected = {joint: number - first for joint, number in since.items() if number is not None}
-        exchanged = find_exchanged_frames(rejected, self.served, tracks, settings.relative_to)
+        exchanged = find_exchanged_frames(rejected, self.served, tracks, self.settings.relative_to)
         verdicts = []
         for joint in self.testable.joints:
             reason, count = self._reasons.get(joint) or exchanged.get(joint, ""), 0
             if joint in data:
-                count = len(data[joint].times)
+                count = len(data[joint].numbers)
             else:
                 reason = reason or f"'{joint.parent}' and '{joint.child}' were never observed together"
             if reason:
                 nothing = math.nan, math.nan
                 verdicts.append(JointVerdict(joint, {}, nothing, count, since.get(joint), reason=reason))
             else:
-                outliers = settings.pair_outliers(joint)
-                verdicts.append(
-                    judge_joint(
-                        self.model,
-                        data[joint],
-                        since[joint],
-                        settings.families,
-                        outliers,
-                        settings.correlation,
-                    )
-                )
-        return Plausibility(tuple(verdicts), self.testable.untested, settings.false_alarms)
+                verdicts.append(judge_joint(self.model, data[joint], since[joint], self.settings))
+        return Plausibility(tuple(verdicts), self.testable.untested, self.settings.false_alarms)
 
 
-def _check_time(at: object, last: float) -> float:
-    if (time := require_time(at)) <= last:
-        raise InvalidValueError(
-            f"The time {time:.9g} is not later than {last:.9g}, that of the observation before. Sort the "
-            "observations by time, and leave out repeated ones."
-        )
-    return time
-
-
-def _check_times(times: npt.ArrayLike | None, count: int) -> Array:
+def _check_times(times: npt.ArrayLike | None, count: int, last: float = -math.inf) -> Array:
     if times is None:
         return np.arange(float(count))
-    try:
-        stamps = np.array(times, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise ShapeError("The times are no array of numbers.") from None
+    stamps = as_numbers(times, "The times")
     if stamps.shape != (count,):
         raise ShapeError(
             f"There are {count} observations, and the times are of shape {stamps.shape}. Each observation "
             "has one time."
         )
-    for before, at in zip([-math.inf, *stamps], stamps.tolist(), strict=False):
-        _check_time(at, before)
+    for before, at in zip([last, *stamps], stamps.tolist(), strict=False):
+        if require_time(at) <= before:
+            raise InvalidValueError(
+                f"The time {at:.9g} is not later than {before:.9g}, that of the observation before. Sort the "
+                "observations by time, and leave out repeated ones."
+            )
     return stamps
 
 
@@ -340,16 +281,15 @@ class PlausibilityMonitor:
         self.model = model
         self.frames = tuple(dict.fromkeys(frames))
         self.count, self.false_alarms = 0, false_alarms
-        self._settings = _TestSettings(
-            false_alarms, as_outliers(outliers), relative_to, families, decorrelation_time
-        )
+        correlation = CorrelationSettings(decorrelation_time, False)
+        self._settings = TestSettings(false_alarms, as_outliers(outliers), relative_to, families, correlation)
         self._noise = noise
-        self._covariances: Array | None = None  # checked covariance of a pose without its own, (1, 6, 6)
         self._last: float | None = None
         self._recent: deque[dict[str, PoseTrack]] = deque(maxlen=keep)
         self._stamps: deque[float] = deque(maxlen=keep)
         self._repairs = {verdict.tag: verdict for verdict in repaired if verdict.replacement is not None}
-        self._tests: dict[TestableJoint, CorrelatedTest] = {}
+        self._tests: dict[TestableJoint, _OnlineTest] = {}
+        native.prepare()
         self._version = model.version
         self._tested = _TestedModel(model, self.frames, self._settings, self._repairs.values())
 
@@ -391,13 +331,17 @@ class PlausibilityMonitor:
             tracks[self._settings.relative_to] = exact_track(1)
         before = set(self.implausible_since)
         if self._last is None:
-            self._settings = self._tested.settings = replace(self._settings, stamped=at is not None)
+            correlation = replace(self._settings.correlation, stamped=at is not None)
+            self._settings = self._tested.settings = replace(self._settings, correlation=correlation)
         self._last = time
         for joint, data in self._tested.observe(tracks, np.array([time]), self.count).items():
             if joint not in self._tests:
-                test = self._tested.begin_test(data)
-                self._tests[joint] = CorrelatedTest(test, self._settings.correlation, self.count)
-            self._tests[joint].add(data.residuals, self.count, time)
+                errors = ErrorCorrelation(self._settings.correlation)
+                self._tests[joint] = _OnlineTest(self._tested.begin_test(data), errors, self.count)
+            begun = self._tests[joint]
+            residuals = data.residuals
+            looks = begun.errors.add(residuals.whitened[0], residuals.orthogonal.shape[1], time)
+            begun.test.observe(residuals, 0, self.count, looks)
         self._recent.append(tracks)
         self._stamps.append(time)
         self.count += 1
@@ -419,7 +363,7 @@ class PlausibilityMonitor:
         return result
 
     def _since(self) -> dict[TestableJoint, int | None]:
-        return {joint: test.implausible_since for joint, test in self._tests.items()}
+        return {joint: each.test.implausible_since for joint, each in self._tests.items()}
 
     def _follow_model(self) -> None:
         """After an edit, find the testable joints, and keep the tests of unchanged ones."""
@@ -435,30 +379,22 @@ class PlausibilityMonitor:
         matrix = as_numbers(pose, f"The pose of '{name}'")
         if matrix.shape != (4, 4):
             raise ShapeError(f"The pose of '{name}' is a 4×4 transform, not of shape {matrix.shape}.")
-        if not covariance and self._covariances is not None and _is_certainly_rigid(matrix):
-            # The usual case in a fraction of the time.
-            return PoseTrack(matrix[None].copy(), self._covariances, _OBSERVED)
         given: PosesLike = (matrix[None], covariance[0]) if covariance else matrix[None]
-        track = check_tracks({name: given}, self._noise)[name]
-        if not covariance:
-            self._covariances = track.covariances
-        return track
+        return check_tracks({name: given}, self._noise)[name]
 
     def _next_time(self, at: float | None) -> float:
-        if self._last is None:
-            return 0.0 if at is None else _check_time(at, -math.inf)
-        if (at is not None) != self._settings.stamped:
-            first = "had one" if self._settings.stamped else "had none"
+        if self._last is not None and (at is not None) != self._settings.correlation.stamped:
+            first = "had none" if at is not None else "had one"
             raise InvalidValueError(f"Either all observations have a time (at=), or none: the first {first}.")
-        return self._last + 1.0 if at is None else _check_time(at, self._last)
+        last = -1.0 if self._last is None else self._last
+        if at is None:
+            return last + 1.0
+        return float(_check_times([at], 1, -math.inf if self._last is None else last)[0])
 
 
-def _is_certainly_rigid(pose: Array) -> bool:
-    """Return True for a pose (4, 4) that needs no further check."""
-    rotation = pose[:3, :3]
-    return (
-        bool(np.abs(rotation.T @ rotation - _EYE_3).max() < 1e-6)
-        and float(np.linalg.det(rotation)) > 0.0
-        and pose[3].tolist() == [0.0, 0.0, 0.0, 1.0]
-        and bool(np.abs(pose[:3, 3]).max() < 1e6)
-    )
+class _OnlineTest(NamedTuple):
+    """Test of one joint, and the correlation of its errors so far."""
+
+    test: SequentialTest
+    errors: ErrorCorrelation
+    begun: int  # number of the first observation

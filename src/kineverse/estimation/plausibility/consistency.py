@@ -10,8 +10,8 @@ is ignored.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
@@ -30,21 +30,10 @@ from kineverse.model.rates import to_plain
 from kineverse.symbols import Symbol
 
 from .report import TestableJoint
-from .residuals import KnownJoint, KnownResiduals, compute_residuals, is_own_limit
+from .residuals import JointObservations, KnownJoint, KnownResiduals, compute_residuals, is_own_limit
 
 # Range of the linearity test in standard deviations, and the accepted relative nonlinearity.
 _RANGE, _NONLINEAR = 2.0, 0.5
-
-
-@dataclass(frozen=True)
-class TimedResiduals:
-    """Residuals of one joint, with the numbers of their observations."""
-
-    times: npt.NDArray[np.int_]  # numbers of the observations, (N,)
-    residuals: KnownResiduals
-
-
-_COMPARED = 50  # number of observations by which exchanged frames are recognised
 
 
 def find_exchanged_frames(
@@ -59,8 +48,7 @@ def find_exchanged_frames(
     def fits(joint: TestableJoint, tracks: Mapping[str, PoseTrack]) -> bool:
         parent, child = tracks[joint.parent], tracks[joint.child]
         rows = np.flatnonzero(parent.observed & child.observed)
-        rows = rows[rows >= since][:_COMPARED]
-        if not len(rows):
+        if not len(rows := rows[rows >= since]):
             return False
         residuals = compute_residuals(served_joints[joint], pair_tracks(parent, child, rows))
         return float(np.median(np.sum(residuals.orthogonal**2, axis=1))) < CHI_SQUARED_6
@@ -99,56 +87,49 @@ class ConsistencyTests:
             return False
         return self._shared_coordinates(joint) == other._shared_coordinates(joint)
 
-    def apply(self, residuals: Mapping[TestableJoint, TimedResiduals]) -> dict[TestableJoint, KnownResiduals]:
-        """Return the residuals of each joint with the results of the tests added."""
-        return {joint: self._apply_to(joint, residuals) for joint in residuals}
+    def apply(
+        self, data: Mapping[TestableJoint, JointObservations]
+    ) -> dict[TestableJoint, JointObservations]:
+        """Return the observations of each joint with the results of the tests added to their residuals."""
+        return {joint: replace(each, residuals=self._apply_to(joint, data)) for joint, each in data.items()}
 
     def _shared_coordinates(self, joint: TestableJoint) -> tuple[Symbol, ...]:
         served = self._served_joints[joint]
         return tuple(x for x in served.coordinates if served.is_plain and self._sources[x] != joint)
 
     def _apply_to(
-        self, joint: TestableJoint, residuals: Mapping[TestableJoint, TimedResiduals]
+        self, joint: TestableJoint, data: Mapping[TestableJoint, JointObservations]
     ) -> KnownResiduals:
-        served, limits, mine = self._served_joints[joint], self._limits[joint], residuals[joint]
+        served, limits, mine = self._served_joints[joint], self._limits[joint], data[joint]
         shared_coordinates = self._shared_coordinates(joint)
         if not limits.slacks and not shared_coordinates:
             return mine.residuals
         others = list(dict.fromkeys([*limits.others, *shared_coordinates]))
-        values, covariances, shared = self._find_other_values(joint, others, mine.times, residuals)
-        excess = limits.excess(served, mine.residuals, values, covariances, shared)
-        disagreement = np.zeros((len(mine.times), len(shared_coordinates)))
-        for j, x in enumerate(shared_coordinates):
-            k, other = served.coordinates.index(x), others.index(x)
-            elsewhere = values[:, other], covariances[:, other, other]
-            disagreement[:, j] = _disagreement(served, mine.residuals, k, *elsewhere, shared[other])
-        columns = [others.index(x) for x in shared_coordinates]
-        return replace(
-            mine.residuals, limit_excess=excess, disagreement=disagreement, other_values=values[:, columns]
-        )
-
-    def _find_other_values(
-        self,
-        joint: TestableJoint,
-        others: Sequence[Symbol],
-        when: npt.NDArray[np.int_],
-        residuals: Mapping[TestableJoint, TimedResiduals],
-    ) -> tuple[Array, Array, npt.NDArray[np.bool_]]:
-        """Return values (N, m), covariances and shared frames of other coordinates; NaN where unknown."""
-        values = np.full((len(when), len(others)), np.nan)
-        covariances = np.zeros((len(when), len(others), len(others)))
-        shared = np.zeros(len(others), dtype=bool)
+        # Values and covariances of other coordinates, NaN where unknown, and those that share a frame.
+        count, m = len(mine.numbers), len(others)
+        values, covariances = np.full((count, m), np.nan), np.zeros((count, m, m))
+        shared = np.zeros(m, dtype=bool)
         for source in {self._sources[x] for x in others}:
             at = np.array([j for j, x in enumerate(others) if self._sources[x] == source])
             shared[at] = bool(self._frames[source] & self._frames[joint])
-            if source not in residuals:
-                continue
-            columns = np.array([self._served_joints[source].coordinates.index(others[j]) for j in at])
-            known = residuals[source]
-            _, mine, theirs = np.intersect1d(when, known.times, return_indices=True)
-            values[np.ix_(mine, at)] = known.residuals.values[np.ix_(theirs, columns)]
-            covariances[np.ix_(mine, at, at)] = known.residuals.covariances[np.ix_(theirs, columns, columns)]
-        return values, covariances, shared
+            if source in data:
+                columns = np.array([self._served_joints[source].coordinates.index(others[j]) for j in at])
+                known = data[source].residuals
+                _, here, there = np.intersect1d(mine.numbers, data[source].numbers, return_indices=True)
+                values[np.ix_(here, at)] = known.values[np.ix_(there, columns)]
+                covariances[np.ix_(here, at, at)] = known.covariances[np.ix_(there, columns, columns)]
+        excess = limits.excess(served, mine.residuals, values, covariances, shared)
+        columns = np.array([others.index(x) for x in shared_coordinates], dtype=int)
+        disagreement = np.zeros((count, len(columns)))
+        for j, other in enumerate(columns):
+            k, elsewhere = (
+                served.coordinates.index(others[other]),
+                (values[:, other], covariances[:, other, other]),
+            )
+            disagreement[:, j] = _disagreement(served, mine.residuals, k, *elsewhere, bool(shared[other]))
+        return replace(
+            mine.residuals, limit_excess=excess, disagreement=disagreement, other_values=values[:, columns]
+        )
 
 
 class _Limits:
@@ -205,34 +186,36 @@ class _Limits:
             for by, covariance in ((by_joints, residuals.covariances), (by_others, covariances[:, :m, :m]))
         )
         z = _deviations(slack, spread, others, bool(shared[:m].any()))
-        # First-order propagation is valid only where the limit is nearly linear within the uncertainty.
         of_joint = np.einsum("nii->ni", residuals.covariances) if served.is_plain else np.zeros((count, n))
         within = np.sqrt(np.concatenate([of_joint, np.einsum("nii->ni", covariances[:, :m, :m])], axis=1))
-        total = np.sqrt(spread + others)
-        for k in range(points.shape[1]):
-            for step in (-_RANGE, _RANGE):
-                moved = points.copy()
-                moved[:, k] += step * within[:, k]
-                bent = self._evaluate(moved)[0] - slack - step * within[:, k, None] * slopes[k]
-                z[~(np.abs(bent) <= _NONLINEAR * _RANGE * total)] = np.nan
+        enough = _NONLINEAR * _RANGE * np.sqrt(spread + others)
+        for k, slope in enumerate(slopes):
+            z[~_is_linear(lambda p: self._evaluate(p)[0], points, k, within[:, k], slope, enough)] = np.nan
         return z
 
-    def _evaluate(self, points: Array) -> Sequence[Array]:
-        results = [np.full((len(points), len(self.slacks)), np.nan) for _ in range(1 + points.shape[1])]
-        waiting = [np.flatnonzero(np.isfinite(points).all(axis=1))]
-        while waiting:
-            rows = waiting.pop()
-            if not len(rows):
-                continue
-            try:
-                parts = self._function.batch(points[rows])
-            except KineverseError:
-                if len(rows) > 1:
-                    waiting += np.array_split(rows, 2)
-                continue
-            for result, part in zip(results, parts, strict=True):
-                result[rows] = part
-        return results
+    def _evaluate(self, points: Array) -> Array:
+        """Return the slacks and their slopes, (1 + n, N, c); NaN where a loop does not close."""
+        result = np.full((1 + points.shape[1], len(points), len(self.slacks)), np.nan)
+        rows = np.isfinite(points).all(axis=1)
+        try:
+            if rows.any():
+                result[:, rows] = self._function.batch(points[rows])
+        except KineverseError:
+            for k in range(len(points) if len(points) > 1 else 0):
+                result[:, k : k + 1] = self._evaluate(points[k : k + 1])
+        return result
+
+
+def _is_linear(
+    function: Callable[[Array], Array], points: Array, k: int, deviations: Array, slope: Array, enough: Array
+) -> npt.NDArray[np.bool_]:
+    """Return True where first-order propagation holds within the uncertainty of coordinate k."""
+    here, result = function(points), np.ones(enough.shape, dtype=bool)
+    for step in (-_RANGE * deviations, _RANGE * deviations):
+        moved = points.copy()
+        moved[:, k] += step
+        result &= enough >= np.abs((function(moved) - here).T - step * slope.T).T
+    return result
 
 
 def _sources(model: Model, served_joints: Mapping[TestableJoint, KnownJoint]) -> dict[Symbol, TestableJoint]:
@@ -261,20 +244,21 @@ def _disagreement(
     try:
         here, expected = served.linearise(residuals.values), served.linearise(there)
         back = np.asarray(np.linalg.pinv(np.nan_to_num(expected.by_joints)), dtype=np.float64)
+
+        def change(values: Array) -> Array:
+            return multiply_vectors(back, pose_difference(served.linearise(values).pose, expected.pose))[:, k]
+
         by_joints = back @ here.by_joints
         spread = (by_joints @ residuals.covariances @ np.swapaxes(by_joints, 1, 2))[:, k, k]
-        off = multiply_vectors(back, pose_difference(here.pose, expected.pose))[:, k]
-        z = _deviations(off, spread, variance, shared)
+        z = _deviations(change(residuals.values), spread, variance, shared)
         # In a singular linkage first-order propagation fails, for either value.
         enough = _NONLINEAR * _RANGE * np.sqrt(spread + variance)
-        sides = (residuals.values, here, residuals.covariances[:, k, k]), (there, expected, variance)
-        for values, linear, of_side in sides:
-            for step in (-_RANGE * np.sqrt(of_side), _RANGE * np.sqrt(of_side)):
-                moved = values.copy()
-                moved[:, k] += step
-                bent = pose_difference(served.linearise(moved).pose, linear.pose)
-                bent -= step[:, None] * linear.by_joints[:, :, k]
-                z[~(np.abs(multiply_vectors(back, bent)[:, k]) <= enough)] = np.nan
+        sides = (
+            (residuals.values, by_joints, residuals.covariances[:, k, k]),
+            (there, back @ expected.by_joints, variance),
+        )
+        for values, slopes, of_side in sides:
+            z[~_is_linear(change, values, k, np.sqrt(of_side), slopes[:, k, k], enough)] = np.nan
     except KineverseError:
         return np.full(len(residuals), np.nan)
     return z

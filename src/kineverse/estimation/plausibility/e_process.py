@@ -39,7 +39,6 @@ import math
 
 import numpy as np
 
-from kineverse.estimation.correlation import CorrelationSettings, ErrorCorrelation
 from kineverse.estimation.noise import CHI_SQUARED_6
 from kineverse.lie import Array
 
@@ -70,27 +69,40 @@ class SequentialTest:
     ) -> None:
         self._threshold = -math.log(false_alarms)
         self._bet = _CensoredBet(outlier_fraction)
-        self.count = 0
-        # Number of independent looks so far, which orders the change points.
-        self._time = 0.0
+        # Number of independent looks so far, which orders the change points, and of those not tested yet.
+        self._time, self._owed = 0.0, 0.0
+        self._numbers: list[int] = []
         self.implausible_since: int | None = None
         self.detected_at: int | None = None
         self._displacement = _DisplacementTest(self._bet, displacement)
         self._unconstrained = _ChangePoints(len(_DEVIATIONS), self._bet)
         self._beyond = _ChangePoints(0, self._bet)
 
-    def count_outlier(self, orthogonal: Array, displacement_jacobian: Array) -> None:
-        """Learn the share of outliers from an observation, also from one that is not added."""
-        self._bet.count(self._displacement.served_square(orthogonal, displacement_jacobian) > _GROSS)
+    def observe(self, residuals: KnownResiduals, row: int, number: int, looks: float) -> None:
+        """Take a row as the observation with a number; of correlated ones, some are tested for all."""
+        if self.implausible_since is not None:
+            return
+        observed = residuals.orthogonal[row], residuals.displacement_jacobian[row]
+        self._owed += 1.0 / looks
+        if self._owed >= _LEAST_WEIGHT:
+            self.add(*observed, residuals.one_sided[row], 1.0 / min(self._owed, 1.0), number)
+            self._owed = 0.0
+        self._bet.count(self._displacement.served_square(*observed) > _GROSS)
 
     def add(
-        self, orthogonal: Array, displacement_jacobian: Array, one_sided: Array, looks: float = 1.0
+        self,
+        orthogonal: Array,
+        displacement_jacobian: Array,
+        one_sided: Array,
+        looks: float = 1.0,
+        number: int | None = None,
     ) -> float:
         """Add one observation; return log M."""
-        time = self._time + 1.0 / looks if self.count else 1.0
+        index = len(self._numbers)
+        self._numbers.append(index if number is None else number)
+        time = self._time + 1.0 / looks if index else 1.0
         weight = math.log((time - self._time) / ((1.0 + self._time) * (1.0 + time)))
-        self._time, index = time, self.count
-        self.count += 1
+        self._time = time
         if index == 0:
             self._limited = np.logical_not(np.isneginf(one_sided))
             self._beyond = _ChangePoints(int(self._limited.sum()) * len(_SLOPES), self._bet)
@@ -113,37 +125,9 @@ class SequentialTest:
         # The rest of the prior weight belongs to change points still to come.
         ratio = float(np.logaddexp.reduce([*logs, -math.log(1.0 + time)]))
         if self.implausible_since is None and ratio >= self._threshold:
-            self.detected_at = index
-            self.implausible_since = parts[int(np.argmax(logs))][2]
+            self.detected_at = self._numbers[index]
+            self.implausible_since = self._numbers[parts[int(np.argmax(logs))][2]]
         return ratio
-
-
-class CorrelatedTest:
-    """Sequential test of one joint that skips correlated observations; others have the weight of all."""
-
-    def __init__(self, test: SequentialTest, correlation: CorrelationSettings, begun: int) -> None:
-        self._test, self._correlation = test, ErrorCorrelation(correlation)
-        self.begun = begun  # number of the first observation
-        self._numbers: list[int] = []
-        self._owed = 0.0
-
-    @property
-    def implausible_since(self) -> int | None:
-        """Number of the first observation that the joint does not explain; None before rejection."""
-        since = self._test.implausible_since
-        return None if since is None else self._numbers[since]
-
-    def add(self, residuals: KnownResiduals, number: int, at: float) -> None:
-        """Add one observation with its number at a time; after a rejection nothing changes."""
-        if self._test.implausible_since is not None:
-            return
-        row = residuals.orthogonal[0], residuals.displacement_jacobian[0]
-        self._owed += 1.0 / self._correlation.add(residuals.whitened[0], len(row[0]), at)
-        if self._owed >= _LEAST_WEIGHT:
-            self._numbers.append(number)
-            self._test.add(*row, residuals.one_sided[0], 1.0 / min(self._owed, 1.0))
-            self._owed = 0.0
-        self._test.count_outlier(*row)
 
 
 class _CensoredBet:

@@ -20,11 +20,7 @@ from kineverse.articulations.joint import OneDofJoint
 from kineverse.compilation import compile
 from kineverse.estimation.identification.families import WX, GroupMotion
 from kineverse.estimation.identification.joint_operations import joint_operation, rigid_pose
-from kineverse.estimation.identification.observations import Observations
-from kineverse.estimation.identification.outlier_rejection import RowIndices
-from kineverse.estimation.identification.result import Fit, project_observations
-from kineverse.estimation.linear_algebra import squared_errors
-from kineverse.estimation.noise import CHI_SQUARED_6
+from kineverse.estimation.identification.result import Fit
 from kineverse.expressions.expression import Expression
 from kineverse.lie import Array, exp_so3, inverse, log_so3, transform
 from kineverse.model.articulation import Articulation
@@ -37,7 +33,7 @@ from kineverse.model.read_recorder import ReadRecorder
 from kineverse.symbols import Symbol
 
 from .report import TestableJoint
-from .residuals import KnownJoint
+from .residuals import JointObservations, KnownJoint
 
 
 @dataclass(frozen=True)
@@ -56,7 +52,7 @@ def find_joint_value(
     model: Model, joint: TestableJoint, served: KnownJoint, records: Mapping[str, Articulation]
 ) -> JointValue | None:
     """Return the value of a joint; None if it has several degrees of freedom."""
-    if served.joints != 1 or len(served.coordinates) != 1:
+    if len(served.coordinates) != 1:
         return None
     (coordinate,) = served.coordinates
     position = next((record.position for record in records.values()), None)
@@ -75,17 +71,6 @@ def follows_another(model: Model, joint: TestableJoint) -> bool:
     """Return True if an operation records an expression that its joint follows, as a mimic joint does."""
     records = _records(model.history.entry(joint.tag).writes, joint)
     return any(record.follows is not None for record in records.values())
-
-
-def extend_fit(fit: Fit, observations: Observations, used: RowIndices) -> tuple[RowIndices, Fit]:
-    """Extend a fit of some observations to all observations that it explains."""
-    others = np.setdiff1d(np.arange(len(observations)), used)
-    if not len(others) or not fit.motion.joints:
-        return used, fit
-    solution = project_observations(fit.motion, fit.joint_values, observations.select(others))
-    fits = squared_errors(solution.residuals, solution.covariance) < CHI_SQUARED_6
-    values = np.concatenate([solution.values[fits], fit.joint_values])
-    return np.concatenate([others[fits], used]), replace(fit, joint_values=values)
 
 
 WrittenValues: TypeAlias = Mapping[tuple[str, str], Any]
@@ -121,10 +106,10 @@ class ReplacedJoint(Operation, document_kind="Relearned"):
         return self.joint.default_tag()
 
 
-def build_replacement(
-    model: Model, joint: TestableJoint, served: KnownJoint, coordinates: Array, others: Array, fit: Fit
-) -> Operation:
-    """Build the operation that replaces a joint."""
+def build_replacement(model: Model, data: JointObservations, fit: Fit) -> Operation:
+    """Build the operation that replaces a joint by a fit of its observations."""
+    joint, served, residuals = data.joint, data.served, data.residuals.select(fit.inliers)
+    fit = replace(fit, joint_values=fit.joint_values[fit.inliers])
     base_T_parent = _constant(model, joint.parent, joint.base)
     frame_T_child = _constant(model, joint.child, joint.frame)
     writes = model.history.entry(joint.tag).writes
@@ -142,6 +127,7 @@ def build_replacement(
     if motion.joints == 1 and before is not None:
         turns = motion.parametrisation.joints[0] >= WX
         same_kind = bool(served.is_angle[0]) == turns
+        coordinates, others = residuals.values, residuals.other_values
         if same_kind and turns and not before.is_derived:
             coordinates = coordinates + _turn_about_axis(served, coordinates, motion, values)
         known = others[:, 0] if others.shape[1] else coordinates[:, 0]
