@@ -383,7 +383,7 @@ def test_numbers_beyond_floating_point_are_refused(outliers):
         lambda: tracker.update({"hinge": np.eye(4)}, at=1e300),
         lambda: tracker.predict(1e10, {"q:velocity": 1e300}),
     ):
-        with pytest.raises(InvalidValueError, match="floating point"):
+        with pytest.raises(InvalidValueError, match="floating point|expected above"):
             step()
     assert tracker.estimate.state == before.state
     assert tracker.estimate.stamp == 0.0
