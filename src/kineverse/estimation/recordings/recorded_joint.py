@@ -86,12 +86,9 @@ class Assumption:
 
 
 @dataclass(frozen=True, eq=False)
-class RecordedJoint:
-    """Joint identified from a recorded pair."""
+class RecordedJoint(Assumption):
+    """Joint identified from a recorded pair, with the assumption under which the answer was found."""
 
-    found: IdentificationResult  # all families, with their probabilities
-    noise: ObservationNoise  # of single observations
-    correlation_time: float  # autocorrelation time of their errors, in rows
     repeated: int  # number of rows that equal the one before; they do not count
     judged: int  # effective sample size by which the families were compared
     fit: Fit  # of the most probable family to all poses, outliers marked
@@ -146,9 +143,9 @@ def identify_recorded_joint(
     others = comparison.alternatives(noise, best, fits, times, rows)
     count = len(comparison.distinct)
     return RecordedJoint(
-        best.found,
         best.noise,
         best.correlation_time,
+        best.found,
         repeated=len(pair.lines) - count,
         judged=max(1, round(count / best.correlation_time)),
         fit=comparison.complete(best, rows),
