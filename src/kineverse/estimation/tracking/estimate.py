@@ -26,11 +26,12 @@ from .speed_update import Residual, SpeedValue
 from .state_space import Layout
 
 Groups = npt.NDArray[np.bool_]
+_AGREEING = 2  # updates in a row that end a loss; a single one may agree by chance
 _QUANTILE = 4.753  # quantile of the standard normal distribution that is exceeded once in a million
 
 
 @dataclass(frozen=True, eq=False)
-class Event:
+class Step:
     """Prediction to a time, or update by measurements at it."""
 
     stamp: float | None  # [s]; None for the present time
@@ -46,19 +47,22 @@ class TrackLoss:
     """Rejected measurements and refuted updates in a row."""
 
     rejected: npt.NDArray[np.int64]  # number of times in a row that each observation was rejected (m,)
-    refuted: npt.NDArray[np.int64]  # number of updates in a row that refute the estimate (groups,)
+    refuted: npt.NDArray[
+        np.int64
+    ]  # updates in a row that refute an estimate, or minus those that agree (groups,)
     is_lost: Groups  # True for each lost group (groups,)
 
     def after(
         self, layout: Layout, reading: Measurements, outliers: Sequence[int], refuted: Groups, lost_after: int
     ) -> TrackLoss:
-        """Return the state after an update; a lost group stays lost until measurements agree with it."""
+        """Return the state after an update; a lost group stays lost until two in a row agree with it."""
         rejected, measured = self.rejected, find_measured(layout, reading)
         if outliers or rejected.any():
             rejected = np.where(reading.mask, 0, rejected)
             rejected[list(outliers)] = self.rejected[list(outliers)] + 1
-        count = np.where(measured, np.where(refuted, self.refuted + 1, 0), self.refuted)
-        is_lost = (self.is_lost | (count >= lost_after)) & (refuted | ~measured)
+        count = np.where(refuted, np.maximum(self.refuted, 0) + 1, np.minimum(self.refuted, 0) - 1)
+        count = np.where(measured, count, self.refuted)
+        is_lost = (self.is_lost & (count > -_AGREEING)) | (count >= lost_after)
         return TrackLoss(rejected, count, is_lost)
 
     def find_due(self, layout: Layout, outliers: Sequence[int], lost_after: int) -> Groups:
@@ -287,7 +291,7 @@ class RecentPoses:
     times: Array | None  # (N,) [s]; None if they have none
 
 
-def collect_recent_poses(model: ModelView, layout: Layout, updates: Sequence[Event]) -> RecentPoses:
+def collect_recent_poses(model: ModelView, layout: Layout, updates: Sequence[Step]) -> RecentPoses:
     """Return the poses of updates with their times, of the first observer among the observations."""
     poses = {i: one for i, one in enumerate(layout.observations) if one.is_pose}
     observer = next((one.relative_to for one in poses.values()), "")

@@ -13,7 +13,7 @@ from kineverse.lie import Array
 from kineverse.state import State, StateLike
 
 from .bounds import SpeedLocks
-from .estimate import Event, TrackerState, TrackLoss, find_refuted
+from .estimate import Step, TrackerState, TrackLoss, find_refuted
 from .gaussian_sum_filter import StepResult, UpdateStep
 from .information_state import InformationState
 from .initialization import InitialBelief
@@ -26,15 +26,15 @@ class FixedLag:
 
     def __init__(self, recursion: Recursion, lag: float) -> None:
         self._recursion, self.lag = recursion, lag
-        self.events: tuple[tuple[float, TrackerState, Event], ...] = ()  # with time and state before
+        self.events: tuple[tuple[float, TrackerState, Step], ...] = ()  # with time and state before
 
-    def append(self, time: float | None, before: TrackerState, event: Event) -> None:
+    def append(self, time: float | None, before: TrackerState, event: Step) -> None:
         """Add an event, and drop those too old for any late measurement."""
         if self.lag and time is not None:
             kept = (one for one in self.events if one[0] >= time - self.lag)
             self.events = (*kept, (time, before, event))
 
-    def insert(self, stamp: float, late: Event) -> TrackerState:
+    def insert(self, stamp: float, late: Step) -> TrackerState:
         """Apply a late measurement at its time, and return the state after all later events."""
         events = [one for one in self.events if one[0] <= stamp]
         later = self.events[len(events) :]
@@ -80,7 +80,7 @@ class Recursion:
         loss = TrackLoss(none, np.zeros(count, dtype=np.int64), np.zeros(count, dtype=bool))
         return TrackerState(mixture, result, loss, inputs, stamp)
 
-    def predict(self, state: TrackerState, dt: float, event: Event) -> TrackerState:
+    def predict(self, state: TrackerState, dt: float, event: Step) -> TrackerState:
         """Return the state after a time step [s]."""
         if dt == 0.0:
             return state
@@ -100,13 +100,13 @@ class Recursion:
 
         return replace(state, mixture=state.mixture.map(moved))
 
-    def _advance(self, state: TrackerState, event: Event) -> TrackerState:
+    def _advance(self, state: TrackerState, event: Step) -> TrackerState:
         """Return the state predicted to the time of an event; a state without a time begins there."""
         if event.stamp is None or state.stamp is None:
             return replace(state, stamp=event.stamp)
         return replace(self.predict(state, event.stamp - state.stamp, event), stamp=event.stamp)
 
-    def apply(self, state: TrackerState, event: Event) -> TrackerState:
+    def apply(self, state: TrackerState, event: Step) -> TrackerState:
         """Return the state after an event."""
         step, values = self.update_step, self.read_inputs(state.inputs, event.inputs)
         if event.reading is None:

@@ -22,7 +22,7 @@ from kineverse.state import State, StateLike
 from kineverse.symbols import Symbol
 
 from .bounds import SpeedLocks, arrange_state
-from .estimate import Estimate, Event, RecentPoses, TrackLoss, collect_recent_poses
+from .estimate import Estimate, RecentPoses, Step, TrackLoss, collect_recent_poses
 from .gaussian_sum_filter import UpdateStep
 from .information_state import InformationState
 from .initialization import InitialValues, make_initial_belief
@@ -150,7 +150,7 @@ class Tracker:
         self._now = self._recursion.start(values, getattr(start, "stamp", None))
         self._buffer = FixedLag(self._recursion, lag)
         self._lock = CallLock()
-        self._recent: deque[Event] = deque(maxlen=keep)
+        self._recent: deque[Step] = deque(maxlen=keep)
 
     @property
     def symbols(self) -> tuple[Symbol, ...]:
@@ -348,7 +348,7 @@ class Tracker:
         """
         dt = as_tolerance(dt, "The length of a step [s]")
         before, known = self._now, self._recursion.read_inputs(self._now.inputs, inputs)
-        event = self._make_event(None, None, commands, inputs, process_noise)
+        event = self._make_step(None, None, commands, inputs, process_noise)
         self._now = self._recursion.predict(replace(before, inputs=known), dt, event)
         self._buffer.append(self._now.stamp, before, replace(event, stamp=self._now.stamp))
         return self.estimate
@@ -402,7 +402,7 @@ class Tracker:
         require_mapping(measurements, "A set of measurements")
         of_state, of_speeds = self._speed_update.read(measurements)
         reading = self._update_step.reader.read(of_state)
-        return self._update(self._make_event(at, reading, commands, inputs, process_noise, of_speeds))
+        return self._update(self._make_step(at, reading, commands, inputs, process_noise, of_speeds))
 
     @one_at_a_time
     def update_poses(
@@ -431,7 +431,7 @@ class Tracker:
             As in :meth:`update`.
         """
         reading = self._update_step.reader.read_poses(poses, mask, covariances)
-        return self._update(self._make_event(at, reading, commands, inputs, process_noise))
+        return self._update(self._make_step(at, reading, commands, inputs, process_noise))
 
     def wait(self, timeout: float | None = None) -> bool:
         """Wait for compiled code; return whether updates use it.
@@ -448,7 +448,7 @@ class Tracker:
         native_library.prepare(wait=True)
         return self._update_step.is_native
 
-    def _make_event(
+    def _make_step(
         self,
         at: float | None,
         reading: Measurements | None,
@@ -456,7 +456,7 @@ class Tracker:
         inputs: StateLike | None,
         process_noise: StateLike | None,
         speeds: Mapping[str, SpeedValue] = MappingProxyType({}),
-    ) -> Event:
+    ) -> Step:
         """Return an event after checks. The caller may use its arrays again."""
         if reading is not None:
             reading = reading._replace(values=reading.values.copy(), mask=reading.mask.copy())
@@ -468,9 +468,9 @@ class Tracker:
                 raise InvalidValueError(f"{subject} need the time they lasted: give at=, or call predict.")
         noise, speeds_now = self._read_noise(process_noise), self._read_commands(commands)
         stamp = None if at is None else require_time(at)
-        return Event(stamp, reading, dict(speeds), copy.copy(inputs), speeds_now, noise)
+        return Step(stamp, reading, dict(speeds), copy.copy(inputs), speeds_now, noise)
 
-    def _update(self, event: Event) -> Estimate:
+    def _update(self, event: Step) -> Estimate:
         before, stamp = self._now, event.stamp
         if stamp is not None and before.stamp is not None and stamp < before.stamp:
             if not self._buffer.lag:
@@ -483,7 +483,7 @@ class Tracker:
             self._now = self._recursion.apply(before, event)
             self._buffer.append(self._now.stamp, before, event)
         inputs = State(dict(zip(self._layout.inputs, self._now.inputs.tolist(), strict=True)))
-        self._recent.append(Event(stamp, event.reading, event.speeds, inputs))
+        self._recent.append(Step(stamp, event.reading, event.speeds, inputs))
         return self.estimate
 
     def __repr__(self) -> str:
