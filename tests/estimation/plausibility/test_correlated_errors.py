@@ -144,16 +144,6 @@ def test_single_observation_has_the_residuals_of_many(
         assert g.T @ g == pytest.approx(h.T @ h, rel=1e-3, abs=0.1)
 
 
-def test_scaled_residuals_are_those_of_scaled_covariances(kitchen: kv.Model) -> None:
-    poses = observe_frames(kitchen, FRAMES, {DOOR: np.linspace(0.1, 1.4, 5)}, 3)
-    served = KnownJoint(kitchen, FRAMES[0], "world")
-    observations = check_observations(None, poses[FRAMES[0]], None, NOISE)
-    scaled = compute_residuals(served, observations).scaled(4.0)
-    expected = compute_residuals(served, observations.scaled(4.0))
-    for field in fields(expected):
-        assert getattr(scaled, field.name) == pytest.approx(getattr(expected, field.name), abs=1e-4)
-
-
 def track(model: kv.Model, poses: Array) -> Tracker:
     """Return a tracker of a model that has taken poses of the handle (N, 4, 4)."""
     tracker = Tracker(model, [ObservedPose(HANDLE, covariance=NOISE)], outliers=True)

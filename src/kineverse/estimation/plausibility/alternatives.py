@@ -84,15 +84,19 @@ def log_evidence(served: KnownJoint, residuals: KnownResiduals, is_static: bool 
     # The expected squared disagreement under a correct model is 1.
     excess = np.nansum(residuals.disagreement**2, axis=0) - np.isfinite(residuals.disagreement).sum(axis=0)
     log -= 0.5 * float(np.maximum(excess, 0.0).sum())
-    widths = _STATIC_WIDTH if is_static else _WIDTHS
-    if len(served.lower) == 1:
-        lower, upper = float(served.lower[0]), float(served.upper[0])
-        density = float(_log_density(served)[0])
-        values, variances = residuals.values[:, 0], residuals.covariances[:, 0, 0]
-        return log + _log_mean(_log_evidence_by_width(values, variances, lower, upper, widths, density))
-    # The prior of several joint values is not truncated; the distance to the limits counts instead.
-    log -= 0.5 * float(np.sum(np.maximum(residuals.bound_excess, 0.0) ** 2))
-    return log + (_log_evidence_of_several(served, residuals, widths) if served.joints else 0.0)
+    best = np.zeros(len(served.lower))
+    for j, (lower, upper) in enumerate(zip(served.lower, served.upper, strict=True)):
+        values, variances = residuals.values[:, j], residuals.covariances[:, j, j]
+        widths = _STATIC_WIDTH if is_static else _WIDTHS
+        logs = _log_evidence_by_width(values, variances, lower, upper, widths, _log_density(served)[j])
+        best[j] = widths[int(np.argmax(logs))]
+        log += _log_mean(logs)
+    if len(best) > 1:
+        # The correlation of joint values, without limits and at the most likely widths.
+        apart = residuals.covariances * np.eye(len(best))
+        log += _log_joint_evidence(residuals.values, residuals.covariances, best)
+        log -= _log_joint_evidence(residuals.values, apart, best)
+    return log
 
 
 def log_displacement_gain(residuals: KnownResiduals, covariances: Iterable[Array]) -> float:
@@ -107,23 +111,14 @@ def log_displacement_gain(residuals: KnownResiduals, covariances: Iterable[Array
     return _log_mean(np.array(logs))
 
 
-def _log_evidence_of_several(served: KnownJoint, residuals: KnownResiduals, widths: Array) -> float:
-    """Return log ∫ Π_k ∫ N(â_k; a, C_k) p(a; μ, s) da dμ at the best widths s, on average."""
-    best, log = np.zeros(len(served.lower)), 0.0
-    for j in range(len(best)):
-        variances = residuals.covariances[:, j, j]
-        logs = _log_evidence_by_width(residuals.values[:, j], variances, -math.inf, math.inf, widths, 0.0)
-        best[j] = widths[int(np.argmax(logs))]
-        log += _log_mean(logs - float(np.max(logs)))
-    total = residuals.covariances + np.diag(best**2)
+def _log_joint_evidence(values: Array, covariances: Array, widths: Array) -> float:
+    """Return log ∫ Π_k ∫ N(â_k; a, C_k) N(a; μ, s²) da dμ of several joint values."""
+    total = covariances + np.diag(widths**2)
     weights = invert_matrices(total)
     information = weights.sum(axis=0)
-    mean = np.linalg.solve(information, multiply_vectors(weights, residuals.values).sum(axis=0))
-    off = residuals.values - mean
-    log -= 0.5 * float(np.sum(off * multiply_vectors(weights, off)))
-    log -= 0.5 * sum_log_determinants(math.tau * total)
-    volume = 0.5 * sum_log_determinants(math.tau * invert_matrices(information)[None])
-    return log + min(volume + float(_log_density(served).sum()), 0.0)
+    off = values - np.linalg.solve(information, multiply_vectors(weights, values).sum(axis=0))
+    log = -0.5 * float(np.sum(off * multiply_vectors(weights, off)))
+    return log - 0.5 * (sum_log_determinants(math.tau * total) + sum_log_determinants(information / math.tau))
 
 
 def _log_density(served: KnownJoint) -> Array:

@@ -70,10 +70,9 @@ class SequentialTest:
         self._threshold = -math.log(false_alarms)
         self._bet = _CensoredBet(outlier_fraction)
         # Number of independent looks so far, which orders the change points, and of those not tested yet.
-        self._time, self._owed = 0.0, 0.0
+        self._time, self._owed = 0.0, _LEAST_WEIGHT
         self._numbers: list[int] = []
         self.implausible_since: int | None = None
-        self.detected_at: int | None = None
         self._displacement = _DisplacementTest(self._bet, displacement)
         self._unconstrained = _ChangePoints(len(_DEVIATIONS), self._bet)
         self._beyond = _ChangePoints(0, self._bet)
@@ -125,7 +124,6 @@ class SequentialTest:
         # The rest of the prior weight belongs to change points still to come.
         ratio = float(np.logaddexp.reduce([*logs, -math.log(1.0 + time)]))
         if self.implausible_since is None and ratio >= self._threshold:
-            self.detected_at = self._numbers[index]
             self.implausible_since = self._numbers[parts[int(np.argmax(logs))][2]]
         return ratio
 

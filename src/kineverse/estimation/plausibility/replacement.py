@@ -115,16 +115,11 @@ def build_replacement(model: Model, data: JointObservations, fit: Fit) -> Operat
     writes = model.history.entry(joint.tag).writes
     records = _records(writes, joint)
     record = next(iter(records), None)
-    if not isinstance(fit.motion, GroupMotion):
-        name = _name(records, joint, served, fit.joint_values.shape[1])
-        operation = fit.operation(name, joint.base, joint.frame)
-        kept = _remaining_writes(writes, joint, served, False, records)
-        places = rigid_pose(base_T_parent), rigid_pose(inverse(frame_T_child))
-        return ReplacedJoint(operation, record, kept, joint.frame, *places)
     motion, values = fit.motion, fit.joint_values
     before = find_joint_value(model, joint, served, records)
     same_kind, position = False, None
-    if motion.joints == 1 and before is not None:
+    places: tuple[Any, ...] = ()
+    if isinstance(motion, GroupMotion) and motion.joints == 1 and before is not None:
         turns = motion.parametrisation.joints[0] >= WX
         same_kind = bool(served.is_angle[0]) == turns
         coordinates, others = residuals.values, residuals.other_values
@@ -146,7 +141,11 @@ def build_replacement(model: Model, data: JointObservations, fit: Fit) -> Operat
         # The old limits stay, widened to the observed range.
         (low, high), *_ = limits
         limits = [(min(low, before.lower), max(high, before.upper))]
-    motion = replace(motion, left=base_T_parent @ motion.left, right=motion.right @ inverse(frame_T_child))
+    if isinstance(motion, GroupMotion):
+        right = motion.right @ inverse(frame_T_child)
+        motion = replace(motion, left=base_T_parent @ motion.left, right=right)
+    else:
+        places = joint.frame, rigid_pose(base_T_parent), rigid_pose(inverse(frame_T_child))
     name = _name(records, joint, served, motion.joints)
     operation = joint_operation(motion, limits, name, joint.base, joint.frame)
     if record is not None and isinstance(operation, Joint):
@@ -154,9 +153,9 @@ def build_replacement(model: Model, data: JointObservations, fit: Fit) -> Operat
     if position is not None and isinstance(operation, OneDofJoint):
         operation = replace(operation, position=position)
     kept = _remaining_writes(writes, joint, served, same_kind, records)
-    if record in (None, name) and not kept:
+    if record in (None, name) and not kept and not places:
         return operation
-    return ReplacedJoint(operation, None if record == name else record, kept)
+    return ReplacedJoint(operation, None if record == name else record, kept, *places)
 
 
 def _records(writes: WrittenValues, joint: TestableJoint) -> dict[str, Articulation]:

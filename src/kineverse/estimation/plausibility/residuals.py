@@ -134,22 +134,19 @@ class KnownJoint(GeneratedMotion):
 
     def _initial_coordinates(self, observations: Observations) -> Array:
         """Return the best coordinates of a grid for each observation."""
-        grid, flat, positions, squares = self._grid_poses
-        observed = observations.relative
-        x, y, z, *turns = np.diagonal(observations.child_covariance.mean(axis=0)).tolist()
-        # ‖R - S‖² = 6 - 2 tr(RᵀS) is twice the square of a small angle.
-        off = (3.0 - observed[:, :3, :3].reshape(-1, 9) @ flat) * (3.0 / sum(turns))
-        off += (squares - 2.0 * observed[:, :3, 3] @ positions) * (3.0 / (x + y + z))
+        grid, poses = self._grid_poses
+        variances = np.diagonal(observations.child_covariance.mean(axis=0))
+        # ‖R - S‖² is twice the square of a small angle.
+        weights = np.tile([0.5 / variances[3:].mean()] * 3 + [1.0 / variances[:3].mean()], 3)
+        observed = observations.relative[:, :3].reshape(-1, 12)
+        off = poses**2 @ weights - 2.0 * (observed * weights) @ poses.T
         return np.asarray(grid[np.argmin(off, axis=1)])
 
     @cached_property
-    def _grid_poses(self) -> tuple[Array, Array, Array, Array]:
-        """Initial values (M, n), their rotations (9, M), positions (3, M) and squared norms of these (M,)."""
+    def _grid_poses(self) -> tuple[Array, Array]:
+        """Initial values (M, n), and the rows of their poses (M, 12)."""
         grid = self._grid()
-        poses = _require_closed(self.linearise(grid)).pose
-        flat = np.ascontiguousarray(poses[:, :3, :3].reshape(-1, 9).T)
-        positions = np.ascontiguousarray(poses[:, :3, 3].T)
-        return grid, flat, positions, np.sum(positions**2, axis=0)
+        return grid, _require_closed(self.linearise(grid)).pose[:, :3].reshape(-1, 12)
 
     def _grid(self) -> Array:
         if not self.joints:
@@ -250,19 +247,6 @@ class KnownResiduals:
         """Return the residuals of some of the observations."""
         return type(self)(*(getattr(self, name)[rows] for name in self.__dataclass_fields__))
 
-    def scaled(self, factor: float) -> Self:
-        """Return the residuals for covariances of the poses that are larger by a factor."""
-        root = math.sqrt(factor)
-        smaller = (
-            "orthogonal", "whitened", "displacement_jacobian", "bound_excess", "limit_excess", "disagreement",
-        )  # fmt: skip
-        return replace(
-            self,
-            covariances=factor * self.covariances,
-            log_scale=self.log_scale + 0.5 * self.orthogonal.shape[1] * math.log(factor),
-            **{name: getattr(self, name) / root for name in smaller},
-        )
-
 
 def compute_residuals(served: KnownJoint, observations: Observations) -> KnownResiduals:
     """Compute the residuals of observations under a served joint."""
@@ -313,6 +297,7 @@ def _whiten(solution: Solution[Any], by_joints: Array) -> tuple[Array, Array, Ar
 
 
 _KEPT = 60  # least number of observations that are kept of correlated ones, if there are as many
+_ALMOST_ONE = 1.1  # factor on covariances that changes no verdict
 
 
 @dataclass(frozen=True)
@@ -339,7 +324,13 @@ class JointObservations:
         kept = min(max(math.ceil(count / looks), _KEPT), count)
         factor = max(looks * kept / count, 1.0)
         result = self if kept == count else self.select(np.linspace(0, count - 1, kept).round().astype(int))
-        if factor == 1.0:
+        if factor < _ALMOST_ONE:
             return result
-        poses, residuals = result.observations.scaled(factor), result.residuals.scaled(factor)
+        poses, before = result.observations.scaled(factor), result.residuals
+        residuals = replace(
+            compute_residuals(self.served, poses),
+            limit_excess=before.limit_excess / math.sqrt(factor),
+            disagreement=before.disagreement / math.sqrt(factor),
+            other_values=before.other_values,
+        )
         return replace(result, observations=poses, residuals=residuals)
