@@ -238,14 +238,13 @@ def log_unwrapping_gain(solution: Solution[FamilyMember]) -> float:
     """
     if not is_screw(solution.motion):
         return 0.0
-    known = solve_per_observation(solution)
-    values = known.values
-    middle = math.atan2(float(np.sin(values).mean()), float(np.cos(values).mean()))
-    turns = np.round((values - middle) / math.tau)
+    middle = math.atan2(float(np.sin(solution.values).mean()), float(np.cos(solution.values).mean()))
+    turns = np.round((solution.values - middle) / math.tau)
     if not turns.any():
         return 0.0
+    known = solve_per_observation(solution)
     logs = []
-    for each in (known, replace(known, values=values - math.tau * turns)):
+    for each in (known, replace(known, values=known.values - math.tau * turns)):
         ranges = fit_joint_ranges(solution.motion, each)
         precision = float(np.sum(1.0 / (ranges.deviations[0] ** 2 + known.covariances[:, 0, 0])))
         # The evidence integrates over the mean, which is less certain with more revolutions.

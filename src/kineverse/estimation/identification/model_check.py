@@ -15,7 +15,7 @@ the noise is stated too small. So families are also compared for a noise of up t
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -81,11 +81,19 @@ _ROUNDS = 3  # largest number of classifications of outliers
 
 
 def weigh_and_check(
-    data: IdentificationData, solutions: FamilySolutions, weights: FamilyWeights
+    data: IdentificationData,
+    solutions: FamilySolutions,
+    weights: FamilyWeights,
+    update: Callable[[], FamilySolutions] | None = None,
 ) -> IdentificationResult:
-    """Return the fits of all families, with the reason if the best is not sure."""
+    """Return the fits of all families, with the reason if the best is not sure.
+
+    If it is doubtful, solutions that are not up to date are replaced by those of ``update``.
+    """
     result = weigh_families(data, solutions, weights) if solutions else None
     is_sure = result is not None and not is_doubtful(data, result, solutions)
+    if not is_sure and update is not None:
+        return weigh_and_check(data, update(), weights)
     if CURVE in weights and not is_sure:
         curve = solve_curve(data, solutions)
         if curve is not None and not _is_explained(curve, solutions):

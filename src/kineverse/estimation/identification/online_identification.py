@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from functools import cache
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import cache, partial
 
 import numpy as np
 import numpy.typing as npt
 
 from kineverse._runtime import CallLock, one_at_a_time
 from kineverse.errors import InvalidValueError, ShapeError
-from kineverse.estimation.linear_algebra import singularity_named
+from kineverse.estimation.linear_algebra import singularity_named, squared_errors
 from kineverse.estimation.noise import Outliers, as_outliers
 
 from .curve import CURVE
@@ -20,17 +21,19 @@ from .joint_values import is_screw
 from .least_squares import InitialGuess
 from .model_check import solve_joints, weigh_and_check
 from .model_selection import (
+    FamilyName,
     FamilySolution,
     FamilySolutions,
     FamilyWeights,
     IdentificationData,
     prepare_data,
     score_solutions,
+    weigh_families,
 )
 from .noise_estimation import NoiseSolution, scale_noise
 from .observations import Observations, check_observations
 from .outlier_rejection import RowIndices, classify_inliers
-from .result import IdentificationResult, project_observations
+from .result import Fit, IdentificationResult, project_observations
 from .solver import solver
 
 
@@ -58,6 +61,17 @@ def warm_start(
     return score_solutions(data, solutions, inliers, weights, renew)
 
 
+def _is_surprised(data: IdentificationData, one: FamilySolution, known: int) -> bool:
+    """Return True if observations after the first ``known`` have outliers, or a χ² too large for noise."""
+    new = len(data.observations) - known
+    if np.count_nonzero(one.inliers >= known) < new:
+        return True
+    solution = one.scored.solution
+    squares = float(squared_errors(solution.residuals[-new:], solution.covariance[-new:]).sum())
+    freedom = solution.residuals[-new:].size
+    return squares > freedom + _SURPRISE * math.sqrt(2.0 * freedom)
+
+
 def _nearest_observations(observations: Observations, known: int) -> RowIndices:
     old, new = observations.relative[None, :known], observations.relative[known:, None]
     return np.asarray(np.argmin(np.sum((old - new) ** 2, axis=(2, 3)), axis=1))
@@ -80,6 +94,9 @@ def _predict_inliers(data: IdentificationData, one: FamilySolution) -> RowIndice
 
 # A family with a smaller probability is not updated until all families are solved again.
 _NEGLIGIBLE = 1e-6
+# A family with a smaller probability is updated after more observations only, or if one is a surprise: its χ²
+# is so many standard deviations above its mean.
+_UNLIKELY, _SURPRISE = 0.02, 2.0
 # Relative increase of observations after which the noise and outliers are estimated again.
 _MORE = 0.125
 
@@ -88,8 +105,9 @@ class Identifier:
     """Online identification of the joint between two parts.
 
     The result is that of :func:`.identify` for all poses so far, at a fraction of the cost: each family
-    starts from its previous solution. A family below one in a million is left out of the result until the
-    number of observations has doubled.
+    starts from its previous solution. A family below 2 % keeps its odds until there are an eighth more poses,
+    one that contradicts the best family, or a doubt. A family below one in a million is left out of the
+    result until the number of observations has doubled.
 
     Parameters
     ----------
@@ -121,6 +139,7 @@ class Identifier:
         self._added: list[Observations] = []  # the first entry may be many
         self._count = 0
         self._solutions: FamilySolutions = {}
+        self._probabilities: Mapping[str, float] = {}
         self._result: IdentificationResult | None = None
         self._full_count, self._noise_count, self._unit = 0, 0, 1.0
 
@@ -194,16 +213,55 @@ class Identifier:
             data = prepare_data(observations, self._stated, self._outliers, self._sequential)
             self._unit = data.unit
             known = solve_joints(data, self._weights)
+            result = weigh_and_check(data, known, self._weights)
         else:
             data = prepare_data(observations, self._stated, self._outliers, self._sequential, self._unit)
-            renew = count >= (1.0 + _MORE) * self._noise_count
-            self._noise_count = count if renew else self._noise_count
-            known = warm_start(data, self._solutions, self._weights, renew)
-        result = weigh_and_check(data, known, self._weights)
-        likely = {name for name, p in result.probabilities.items() if p > _NEGLIGIBLE} - {CURVE}
+            result, known = self._continue(data)
+        likely = {name: p for name, p in result.probabilities.items() if p > _NEGLIGIBLE and name != CURVE}
         kept = {name: one for name, one in known.items() if one.scored.solution.motion.name in likely}
-        self._solutions = kept or known
+        self._solutions, self._probabilities = kept or known, likely
         return result
+
+    def _continue(self, data: IdentificationData) -> tuple[IdentificationResult, FamilySolutions]:
+        """Return the result that continues the previous one, and the solutions.
+
+        Unlikely families are not updated at every pose: they keep their odds to the best one.
+        """
+        count, known, weights = len(data.observations), self._solutions, self._weights
+        renew = count >= (1.0 + _MORE) * self._noise_count
+        self._noise_count = count if renew else self._noise_count
+        before = {
+            name: self._probabilities.get(one.scored.solution.motion.name, 1.0) for name, one in known.items()
+        }
+        best = max(before, key=before.__getitem__)
+        likely = {name: one for name, one in known.items() if renew or before[name] > _UNLIKELY}
+        solutions = warm_start(data, likely, weights, renew)
+        older = {name: one for name, one in known.items() if name not in likely}
+
+        def update() -> FamilySolutions:
+            nonlocal older
+            solutions.update(warm_start(data, older, weights, renew))
+            older = {}
+            return solutions
+
+        if older and _is_surprised(data, solutions[best], known[best].count):
+            update()
+        top = solutions[best].log_evidence + solutions[best].log_prior + math.log(weights[best])
+        every = dict(solutions)
+        for name, one in older.items():
+            log = top + math.log(before[name] / before[best] / weights[name])
+            every[name] = replace(one, log_prior=log - one.log_evidence)
+        result = weigh_and_check(data, every, weights, update if older else None)
+
+        def fit(name: FamilyName, one: FamilySolution, probability: float) -> Fit:
+            alone = warm_start(data, {name: one}, weights, renew)
+            return replace(weigh_families(data, alone, weights).best, probability=probability)
+
+        lazy = {each.family: each for each in result.lazy_fits}
+        for name, one in older.items():
+            family = one.scored.solution.motion.name
+            lazy[family] = lazy[family]._replace(compute=partial(fit, name, one, lazy[family].probability))
+        return replace(result, lazy_fits=tuple(lazy.values())), solutions | older
 
 
 def _join(parts: Sequence[Observations]) -> Observations:

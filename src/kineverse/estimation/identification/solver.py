@@ -39,7 +39,7 @@ from .observations import Observations
 
 _FIRST_STEPS = 2  # steps of each of several starts, before the best of them continues
 # Rounds of ranges and solutions, steps of each, and change of the log widths at convergence.
-_TURNS, _TURN_STEPS, _SETTLED = 8, 10, 0.01
+_TURNS, _TURN_STEPS, _SETTLED = 8, 10, 0.03
 _NARROWEST = 1e-4  # least width of a range [m], [rad]
 _KEPT = 4_000_000  # largest number of doubles of a work memory that is kept between calls
 _ONE = np.ones((1, 2))
