@@ -7,7 +7,6 @@ import math
 from collections import deque
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
-from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -65,23 +64,21 @@ class Tracker:
         coordinate's; by default half the width of the limits, π for angles, 10 m. Those of estimated speeds
         [m/s], [rad/s] by speed.
     process
-        Process model: ``"position"`` for positions that move at random, ``"velocity"`` for speeds that change
-        at random and are estimated, ``"static"`` for a state that is constant unless it is commanded. By
-        default speeds are estimated, and decay within seconds, where wheels or other rates move a part and
-        where speeds are measured; all other positions move at random.
+        ``"position"`` for positions that move at random, ``"velocity"`` for speeds that change at random and
+        are estimated, ``"static"`` for a state that is constant unless it is commanded. By default decaying
+        speeds are estimated where rates, as of wheels, move a part or speeds are measured; other positions
+        move at random.
     process_noise
         Process noise by speed or coordinate: the variance per second, or for ``process="velocity"`` the
-        spectral density of the acceleration [m²/s³], [rad²/s³]. By default that of furniture that a hand
-        moves, see :mod:`.process_model`, and none for ``process="static"``. 0 for a part that never moves.
-        Without ``process=`` it is that of positions.
+        spectral density of the acceleration [m²/s³], [rad²/s³]; 0 for a part that never moves. By default
+        that of furniture that a hand moves. Without ``process=`` it is that of positions.
     outliers
         Outlier model: :class:`Outliers`, or True for the default one. None if all errors have the stated
         noise.
     locks
         True if coordinates held by a lock of the model ignore commands and process noise.
     inputs
-        Coordinates that are measured elsewhere, such as a robot's joints. Each step takes their values as
-        ``inputs``.
+        Coordinates that are measured elsewhere, such as a robot's joints; each step takes their values.
     lost_after
         Number of updates in a row that refute a group of coordinates until it is lost: all of its
         measurements are rejected, or without an outlier model, their normalised innovation squared is one in
@@ -455,7 +452,7 @@ class Tracker:
         commands: StateLike | None,
         inputs: StateLike | None,
         process_noise: StateLike | None,
-        speeds: Mapping[str, SpeedValue] = MappingProxyType({}),
+        speeds: Mapping[str, SpeedValue] | None = None,
     ) -> Step:
         """Return an event after checks. The caller may use its arrays again."""
         if reading is not None:
@@ -468,7 +465,7 @@ class Tracker:
                 raise InvalidValueError(f"{subject} need the time they lasted: give at=, or call predict.")
         noise, speeds_now = self._read_noise(process_noise), self._read_commands(commands)
         stamp = None if at is None else require_time(at)
-        return Step(stamp, reading, dict(speeds), copy.copy(inputs), speeds_now, noise)
+        return Step(stamp, reading, speeds or {}, copy.copy(inputs), speeds_now, noise)
 
     def _update(self, event: Step) -> Estimate:
         before, stamp = self._now, event.stamp
@@ -482,7 +479,8 @@ class Tracker:
         else:
             self._now = self._recursion.apply(before, event)
             self._buffer.append(self._now.stamp, before, event)
-        inputs = State(dict(zip(self._layout.inputs, self._now.inputs.tolist(), strict=True)))
+        known = dict(zip(self._layout.inputs, self._now.inputs.tolist(), strict=True))
+        inputs = State(known) if known else None
         self._recent.append(Step(stamp, event.reading, event.speeds, inputs))
         return self.estimate
 
