@@ -256,7 +256,11 @@ def test_thin_reduces_the_number_of_poses(door, capsys):
         ("", [], "the file is empty"),
         ("0 0 0\n", [], "one pose"),
         ("0 0 0\n0 nan 0\n", [], "line 2: y is missing"),
-        ("pose.orientation.x,pose.orientation.y,pose.orientation.z\n0,0,1\n", [], "no column qw"),
+        (
+            "pose.orientation.x,pose.orientation.y,pose.orientation.z\n0,0,1\n",
+            [],
+            "no positions x, y, z, and no qw",
+        ),
         ("0 0 0\n0 40 0\n", [], "Say --units m or --units mm"),
         ("0 0 0\n0 40 0\n", ["--units", "inch"], "'inch' is no unit"),
         ("1 2 3\n1 2 3\n1 2 3\n", [], "All 3 poses are the same in every digit"),
@@ -389,3 +393,21 @@ def test_the_model_of_a_joint_is_made_from_python_too(door):
     model = recordings.make_joint_model(recorded, learned.fit)
     assert [str(s) for s in model.degrees_of_freedom] == ["door"]
     assert model.articulations["door"].parent == "cupboard"
+
+
+def test_poses_in_the_plane_take_a_stated_noise(tmp_path, capsys):
+    """Without noise in z, roll and pitch, a planar joint would explain any motion in the plane exactly."""
+    rng, angles = np.random.default_rng(0), np.linspace(0.0, 1.3, 40)
+    places = 0.5 * np.column_stack([np.cos(angles), np.sin(angles)]) + 0.003 * rng.standard_normal((40, 2))
+    rows = np.column_stack([places, angles + 0.01 * rng.standard_normal(40)])
+    table, words = tmp_path / "slam.csv", ("--families", "prismatic,revolute,planar")
+    table.write_text("\n".join(["x,y,yaw [rad]", *(",".join(map(str, row)) for row in rows)]))
+    assert main(["fit", str(table), *words]) == 2
+    said = capsys.readouterr().err
+    assert "z = roll = pitch = 0" in said
+    assert "--noise 3mm,1deg" in said
+    assert answer([str(table), *words, "--noise", "0.003,0.01"], capsys)["family"] == "revolute"
+    table.write_text("\n".join(["x,y,z", *(f"{x},{y},0" for x, y in places)]))
+    assert main(["fit", str(table), *words]) == 2
+    assert "the same z" in capsys.readouterr().err
+    assert answer([str(table), *words, "--noise", "0.003"], capsys)["family"] == "revolute"

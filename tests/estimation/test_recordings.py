@@ -216,6 +216,28 @@ def test_exports_of_other_programs_are_read(case, tmp_path):
     assert recording.assumptions == assumed
 
 
+@pytest.mark.parametrize(
+    ("head", "separator", "assumed"),
+    [
+        ("x_mm;y_mm;z_mm;yaw (deg)", ";", ("roll = pitch = 0",)),
+        ("x,y,theta", ",", ("z = roll = pitch = 0", "angles in rad")),
+        ("t;door.x;door.y;door.heading_deg", ";", ("z = roll = pitch = 0",)),
+    ],
+)
+def test_poses_in_the_plane_are_read(head, separator, assumed, tmp_path):
+    turns = np.linspace(0, 1.4, 30)
+    truth = 0.3 * np.column_stack([np.cos(turns), np.sin(turns), 0 * turns])
+    lengths, angle = (1000 if "mm" in head else 1), (180 / np.pi if "deg" in head else 1)
+    columns = [lengths * truth[:, : 3 if "z_mm" in head else 2], angle * turns[:, None]]
+    columns = [0.1 * np.arange(30)] * head.startswith("t") + columns
+    recording = read_recording(write_table(tmp_path, export(head, columns, separator)))
+    (track,) = recording.tracks.values()
+    np.testing.assert_allclose(track.poses[:, :3, 3], truth, atol=1e-12)
+    turned = Rotation.from_rotvec(turns[:, None] * [0, 0, 1]).as_matrix()
+    np.testing.assert_allclose(track.poses[:, :3, :3], turned, atol=1e-12)
+    assert recording.assumptions == assumed
+
+
 def test_decimal_commas_are_read(tmp_path):
     for separator in (";", " ", "\t"):
         text = export("", [P, Q], separator).replace(".", ",")
@@ -256,6 +278,7 @@ def test_frames_and_arrays_are_read():
 LINE = np.linspace(0, 1, 30)[:, None] * [1.0, 0.5, 0.2]
 AMBIGUOUS = {  # name: head, columns, message
     "only an orientation": (",".join(ROS.split(",")[3:]), [Q], "an orientation, but no position"),
+    "three numbers of an orientation": (",".join(ROS.split(",")[3:6]), [Q[:, :3]], "no positions x, y, z, and no qw, the fourth number"),
     "a quaternion without w": (ROS.rpartition(",")[0], [P, Q[:, :3]], "no column qw. Three angles are called roll"),
     "metres or millimetres": ("x,y,z", [40 * LINE], "metres or millimetres.*--units m or --units mm"),
     "far away": ("x,y,z", [LINE + 431733], "no room holds this"),
@@ -325,6 +348,8 @@ BAD = {
     "no position": ("qx,qy,qz,qw\n0,0,0,1\n", "an orientation, but no position"),
     "nothing known": ("speed,force\n1,2\n", "no column is a position"),
     "a lacking column": ("x,y,z,quart,qy,qz,qw\n1,2,3,0,0,0,1\n", "no column qx. Not understood: 'quart'"),
+    "x and y alone": ("x,y\n1,2\n", "no column z"),
+    "roll without pitch": ("x,y,z,roll,yaw,\n1,2,0,0,0,\n", "no column pitch"),
     "a part lacks z": ("A.x,A.y,B.x,B.y,B.z\n1,2,3,4,5\n", "line 1: the part 'A' has no column z"),
     "two orientations": ("x,y,z,rx,ry,rz,roll,pitch,yaw\n1,2,3,4,5,6,7,8,9\n", "orientation twice"),
     "a column twice": ("x,y,z,x\n1,2,3,4\n", "two columns 'x'"),

@@ -6,7 +6,7 @@
 
 /* How many numbers of memory the functions below need. */
 EXPORTED int64_t memory_of(int64_t count) {
-  return 1000 + count * (72 + 2 * (int64_t)(sizeof(Observation) / sizeof(double)));
+  return 1000 + count * (72 + 3 * (int64_t)(sizeof(Observation) / sizeof(double)));
 }
 
 /* Joint values, their covariances and the information of parameters and means, by observations and ranges. */
@@ -114,4 +114,46 @@ EXPORTED void rate(const Problem *p, int64_t sizes, const double *factors, const
     memcpy(deviations, apart.deviations, joints * sizeof(double));
     memcpy(mean, apart.mean, joints * sizeof(double));
   }
+}
+
+/* As levenberg_marquardt in least_squares.py, from the parents of the answer and the best of several starts
+   after a few steps. Starts are a state and joint values each. The evidence comes with it. */
+EXPORTED void solve(Problem *p, int64_t starts, const double *begin, int64_t few, int64_t steps,
+                    double *memory, double *answer) {
+  Answer a = lay(p, answer);
+  const double one[2] = {1.0, 1.0};
+  double *work = memory;
+  int64_t values = p->count * p->joints;
+  memory = prepare(p->parent_covariance, p->count, 6, memory, &p->of_parent);
+  memory = prepare(p->child_covariance, p->count, p->rows, memory, &p->of_child);
+  Observation *best = (Observation *)memory, *here = best + p->count, *there = here + p->count;
+  watch_begin(&watch, INFINITY);
+  for (int64_t s = 0; s < starts; s++, begin += p->states + values) {
+    double x[STATES], cost;
+    memcpy(x, begin, p->states * sizeof(double));
+    for (int64_t k = 0; k < p->count; k++) {
+      memcpy(here[k].parent, a.parents + 16 * k, sizeof here[k].parent);
+      memcpy(here[k].values, begin + p->states + p->joints * k, p->joints * sizeof(double));
+    }
+    int converged = settle(p, x, &here, &there, starts > 1 ? few : steps, &cost);
+    if (s && !(cost < *a.cost)) continue;
+    Observation *other = best;
+    best = here;
+    here = other;
+    memcpy(a.x, x, p->states * sizeof(double));
+    *a.cost = cost;
+    *a.converged = converged;
+  }
+  if (starts > 1 && !*a.converged) *a.converged = settle(p, a.x, &best, &there, steps, a.cost);
+  for (int64_t k = 0; k < p->count; k++) {
+    const Observation *o = best + k;
+    int64_t each = p->rows * k;
+    memcpy(a.parents + 16 * k, o->parent, sizeof o->parent);
+    memcpy(a.values + p->joints * k, o->values, p->joints * sizeof(double));
+    memcpy(a.residuals + each, o->residual, p->rows * sizeof(double));
+    memcpy(a.covariances + p->rows * each, o->covariance, p->rows * p->rows * sizeof(double));
+    keep(p, o, a.poses + 16 * k, a.by_parameters + p->size * each, a.by_joints + p->joints * each);
+  }
+  rate(p, 1, one, NULL, 1.0, work, a.x, a.values, a.residuals, a.covariances, a.by_joints, a.integral,
+       a.integral + 1);
 }

@@ -236,7 +236,7 @@ def format_doubt(learned: RecordedJoint) -> str:
     return first + ", ".join(answers)
 
 
-def _format_assumption(assumed: RecordedJoint | Assumption, made: RecordedJoint) -> str:
+def _format_assumption(assumed: Assumption, made: RecordedJoint) -> str:
     if assumed.correlation_time != made.correlation_time:
         return f"errors are alike over {format_number(assumed.correlation_time, 2)} rows"
     return f"the noise is {_format_deviations(assumed.noise)}"

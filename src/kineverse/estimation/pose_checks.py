@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from kineverse.errors import InvalidValueError, ShapeError
+from kineverse.expressions.expression import Expression
 from kineverse.lie import Array
 
 from .noise import pose_covariance
@@ -31,7 +32,9 @@ def as_numbers(values: npt.ArrayLike, label: str) -> Array:
             raise TypeError
         return np.asarray(values, dtype=np.float64)
     except (TypeError, ValueError):
-        raise ShapeError(f"{label} are no array of numbers.") from None
+        is_expression = isinstance(values, Expression)
+        hint = " expression({symbol: value}) has those of an expression." if is_expression else ""
+        raise ShapeError(f"{label}: this is no array of numbers: {values!r:.80}.{hint}") from None
 
 
 def check_rigid(poses: Array, part: str) -> None:

@@ -83,7 +83,6 @@ def test_evidence_is_that_of_a_sum_over_noises_with_a_solution_for_each(family: 
             InitialGuess(solution.motion, solution.values),
             solution.parent,
             solution.joint_prior,
-            len(data.observations),
         )
         prior = -0.5 * float(logs @ logs) / spread**2 - math.log(math.tau * spread**2)
         total.append(identified.log_evidence + prior)

@@ -212,29 +212,6 @@ def test_update_leaves_a_vanishing_jacobian_of_a_cosine(outliers, limit):
     assert estimate.deviation["q"] < 0.01
 
 
-def test_groups_with_affine_measurements_have_a_single_minimum():
-    """A drawer, but no hinge, no angle with a period, and no distance."""
-    model = kv.Model()
-    with model.edit() as edit:
-        edit.apply(kv.Prismatic(name="drawer", parent="world", child="drawer", lower=0, upper=0.4))
-        edit.apply(kv.Prismatic(name="box", parent="drawer", child="box", axis=(0, 1, 0), lower=0, upper=0.4))
-        edit.apply(kv.Revolute(name="door", parent="world", child="door", axis=(0, 0, 1), lower=0, upper=1.5))
-    drawer, door = kv.position("drawer"), kv.position("door")
-    for observed, expected in (
-        (["drawer", "box"], [True]),
-        (["door"], [False]),
-        (["drawer", "door"], [True, False]),
-        (["drawer", ObservedExpression("dial", drawer, 0.01, period=0.1)], [False]),
-        (["drawer", ObservedExpression("curve", np.sin(drawer), 0.01)], [False]),
-        ([ObservedExpression("number", 2 * door + 1, 0.01)], [True]),
-        ([ObservedPosition("door", (1, 0, 0))], [False]),
-        ([ObservedPose("box", relative_to="door")], [False]),
-    ):
-        layout = Tracker(model, observed)._layout
-        result = {group.coordinates[-1]: layout.is_affine(k) for k, group in enumerate(layout.groups)}
-        assert sorted(result.values()) == sorted(expected), observed
-
-
 def test_update_leaves_the_singularity_of_a_stretched_arm():
     model = kv.Model()
     with model.edit() as edit:

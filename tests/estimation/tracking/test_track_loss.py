@@ -104,7 +104,7 @@ def test_outliers_alone_are_no_track():
     model, rng = kv.Model(), np.random.default_rng(0)
     with model.edit() as edit:
         edit.apply(kv.Floating(name="box", parent="world", child="box"))
-    tracker, lost = Tracker(model, ["box"], process="position", outliers=True), []
+    tracker, lost = Tracker(model, ["box"], outliers=True), []
     for k in range(25):
         pose = kv.axis_angle(rng.standard_normal(3), rng.uniform(0, 3))()
         pose[:3, 3] = rng.uniform(-1, 1, 3)
@@ -383,7 +383,7 @@ def test_numbers_beyond_floating_point_are_refused(outliers):
         lambda: tracker.update({"hinge": np.eye(4)}, at=1e300),
         lambda: tracker.predict(1e10, {"q:velocity": 1e300}),
     ):
-        with pytest.raises(InvalidValueError, match="floating point"):
+        with pytest.raises(InvalidValueError, match=r"floating point|expected above"):
             step()
     assert tracker.estimate.state == before.state
     assert tracker.estimate.stamp == 0.0

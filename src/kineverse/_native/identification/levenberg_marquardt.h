@@ -6,10 +6,10 @@
 /* Stages end early if a handler of signals has raised an exception; then nobody looks at the answer. */
 static _Thread_local Watch watch;
 
-/* A solution as Python has it, in one memory: state, then arrays of the observations. */
+/* A solution as Python has it, in one memory: state, arrays of the observations, and its integral. */
 typedef struct {
   double *cost, *converged, *x, *values, *parents, *residuals, *covariances, *poses, *by_parameters,
-      *by_joints;
+      *by_joints, *integral;
 } Answer;
 
 static Answer lay(const Problem *p, double *memory) {
@@ -22,6 +22,7 @@ static Answer lay(const Problem *p, double *memory) {
   a.poses = a.covariances + p->count * rows * rows;
   a.by_parameters = a.poses + p->count * 16;
   a.by_joints = a.by_parameters + p->count * rows * p->size;
+  a.integral = a.by_joints + p->count * rows * p->joints;
   return a;
 }
 
@@ -69,27 +70,4 @@ static int settle(const Problem *p, double *x, Observation **here, Observation *
     }
   }
   return 0;
-}
-
-/* As levenberg_marquardt in least_squares.py, from state, joint values and parents of the answer. */
-EXPORTED void solve(Problem *p, int64_t steps, double *memory, double *answer) {
-  Answer a = lay(p, answer);
-  memory = prepare(p->parent_covariance, p->count, 6, memory, &p->of_parent);
-  memory = prepare(p->child_covariance, p->count, p->rows, memory, &p->of_child);
-  Observation *here = (Observation *)memory, *there = here + p->count;
-  watch_begin(&watch, INFINITY);
-  for (int64_t k = 0; k < p->count; k++) {
-    memcpy(here[k].parent, a.parents + 16 * k, sizeof here[k].parent);
-    memcpy(here[k].values, a.values + p->joints * k, p->joints * sizeof(double));
-  }
-  *a.converged = settle(p, a.x, &here, &there, steps, a.cost);
-  for (int64_t k = 0; k < p->count; k++) {
-    const Observation *o = here + k;
-    int64_t each = p->rows * k;
-    memcpy(a.parents + 16 * k, o->parent, sizeof o->parent);
-    memcpy(a.values + p->joints * k, o->values, p->joints * sizeof(double));
-    memcpy(a.residuals + each, o->residual, p->rows * sizeof(double));
-    memcpy(a.covariances + p->rows * each, o->covariance, p->rows * p->rows * sizeof(double));
-    keep(p, o, a.poses + 16 * k, a.by_parameters + p->size * each, a.by_joints + p->joints * each);
-  }
 }

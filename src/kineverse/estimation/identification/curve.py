@@ -23,7 +23,7 @@ import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import NamedTuple, Self
+from typing import Self
 
 import numpy as np
 
@@ -58,13 +58,6 @@ _CURVATURE = 20.0
 _LOG_WIDTH, _LEAST_WIDTH = -3.0, 1e-4
 
 
-class SplineWeights(NamedTuple):
-    """Value and slope of a natural cubic spline as linear functions of its values at the knots, (N, K)."""
-
-    values: Array
-    slopes: Array
-
-
 @dataclass(frozen=True)
 class NaturalSpline:
     """Natural cubic spline through equidistant knots."""
@@ -95,8 +88,11 @@ class NaturalSpline:
             right[k + 1, k : k + 2] += (-3.0 / step, 3.0 / step)
         return np.asarray(np.linalg.solve(system, right))
 
-    def weights(self, u: Array) -> SplineWeights:
-        """Return the weights of the knots at u, (N,). Beyond the ends the spline is straight."""
+    def weights(self, u: Array) -> tuple[Array, Array]:
+        """Return the value and the slope at u, (N,), as linear functions of the values at the knots, (N, K).
+
+        Beyond the ends the spline is straight.
+        """
         each, step, slopes = np.eye(self.count), self.step, self.knot_slopes
         inside = np.clip(u, self.first, self.last)
         beyond = (u - inside)[:, None]
@@ -107,7 +103,7 @@ class NaturalSpline:
         values += step * t * (1.0 - t) * ((1.0 - t) * before - t * after)
         rates = 6.0 * t * (1.0 - t) / step * (each[k + 1] - each[k])
         rates += (1.0 - t) * (1.0 - 3.0 * t) * before + t * (3.0 * t - 2.0) * after
-        return SplineWeights(values + beyond * rates, rates)
+        return values + beyond * rates, rates
 
 
 def whiten_path(poses: Array, rows: int) -> Array:
@@ -170,11 +166,6 @@ class CurveMotion:
         """Number of parameters."""
         return self.spline.count * (self.rows - 1)
 
-    @property
-    def length(self) -> float:
-        """Length of the curve between its end knots."""
-        return self.spline.last - self.spline.first
-
     def linearise(self, values: Array) -> LinearisedPoses:
         """Return the poses at joint values (N, 1) and their derivatives."""
         weights, rates = self.spline.weights(values[:, 0])
@@ -217,7 +208,7 @@ class CurveMotion:
         by[steps, :, steps] = -self.across[:-1]
         by[steps, :, steps + 1] = self.across[1:]
         whitening, bend = self.whitening, min(1.0, _CURVATURE / (count - 1) ** 2)
-        moved = self._differences
+        moved = _steps_between(transform(quaternion(self.quaternions), self.positions), rows)
         residuals = np.concatenate([np.diff(moved, axis=0) / bend, moved.sum(axis=0)[None]])
         derivatives = np.concatenate([np.diff(by, axis=0) / bend, by.sum(axis=0)[None]])
         by_parameters = np.einsum("ij,njke->nike", whitening, derivatives)
@@ -244,7 +235,7 @@ class CurveMotion:
     def named_parameters(self) -> dict[str, Array | float]:
         """Return the parameters by name."""
         poses = transform(quaternion(self.quaternions), self.positions)
-        return {"length": self.length, "knots": self.spline.knots, "poses": poses}
+        return {"length": self.spline.last - self.spline.first, "knots": self.spline.knots, "poses": poses}
 
     def coordinates(self) -> tuple[str, ...]:
         """Return the names of the parameters: each knot moves in several directions across the curve."""
@@ -271,14 +262,13 @@ class CurveMotion:
         columns = zip(values.T.tolist(), ends.T.tolist(), strict=True)
         return [spline(joint, knots, column, slopes=(first, last)) for column, (first, last) in columns]
 
-    @cached_property
-    def _differences(self) -> Array:
-        """Twists from each knot to the next, (K - 1, m)."""
-        moved = np.diff(self.positions, axis=0)
-        if self.rows == 3:
-            return moved
-        turns = quaternion(self.quaternions)
-        return np.concatenate([moved, log_so3(turns[1:] @ np.swapaxes(turns[:-1], 1, 2))], axis=1)
+
+def _steps_between(poses: Array, rows: int) -> Array:
+    """Return the twists from each pose to the next, (N - 1, m)."""
+    moved = np.diff(poses[:, :3, 3], axis=0)
+    if rows == 3:
+        return moved
+    return np.concatenate([moved, log_so3(poses[1:, :3, :3] @ np.swapaxes(poses[:-1, :3, :3], 1, 2))], axis=1)
 
 
 def _in_rows(by_knots: Array) -> Array:
@@ -322,12 +312,12 @@ def fit_curve(
     log_evidence: Callable[[Solution[FamilyMember]], float],
 ) -> Scored:
     """Return the most probable curve through observations that :func:`may_be_curve` accepts."""
+    deviations = np.asarray(np.sqrt(np.einsum("nii->ni", covariance).mean(axis=0)))
     if len(observations) > _MOST_FITTED:
         some = np.linspace(0, len(observations) - 1, _MOST_FITTED).round().astype(int)
         thinned = observations.select(some), covariance[some], [order[some] for order in orders]
-        motion, deviations = _as_curve(fit_curve(*thinned, log_evidence).solution), _deviations(covariance)
-        return _scored(observations, motion, _nearest(observations, deviations, motion))
-    deviations = _deviations(covariance)
+        solution = fit_curve(*thinned, log_evidence).solution
+        return continue_curve(observations, solution, _nearest(observations, deviations, solution.motion))
     possible = [count for count in KNOTS if count <= _DENSEST * len(observations)]
     middle = max(k for k, count in enumerate(possible) if count <= _COARSE)
     points = _whitened(observations.relative, observations.relative, deviations)
@@ -353,24 +343,13 @@ def fit_curve(
     return continue_curve(observations, best.solution)
 
 
-def continue_curve(observations: Observations, before: Solution[FamilyMember]) -> Scored:
-    """Return the curve with the knots and joint values of an earlier one."""
-    return _scored(observations, _as_curve(before), before.values)
-
-
-def _scored(observations: Observations, motion: CurveMotion, values: Array) -> Scored:
-    solution = levenberg_marquardt(observations, motion, values, steps=2 * _STEPS)
+def continue_curve(
+    observations: Observations, before: Solution[FamilyMember], values: Array | None = None
+) -> Scored:
+    """Return the curve with the knots of an earlier one, and its joint values if no others are given."""
+    values = before.values if values is None else values
+    solution = levenberg_marquardt(observations, before.motion, values, steps=2 * _STEPS)
     return Scored(solution, laplace_evidence(solution).log_evidence)
-
-
-def _deviations(covariance: Array) -> Array:
-    return np.asarray(np.sqrt(np.einsum("nii->ni", covariance).mean(axis=0)))
-
-
-def _as_curve(solution: Solution[FamilyMember]) -> CurveMotion:
-    motion = solution.motion
-    assert isinstance(motion, CurveMotion)
-    return motion
 
 
 def _whitened(poses: Array, around: Array, deviations: Array) -> Array:
@@ -400,7 +379,7 @@ def _length_along_path(points: Array) -> Array:
 
 def _regressed(observations: Observations, along: Array, count: int) -> CurveMotion:
     spline = NaturalSpline(0.0, (len(along) - 1) / (count - 1), count)
-    weights = spline.weights(np.arange(len(along), dtype=np.float64)).values
+    weights = spline.weights(np.arange(len(along), dtype=np.float64))[0]
     relative = observations.relative[np.argsort(along, kind="stable")]
     # Each quaternion is on the half of the sphere of the one before.
     turns = to_quaternion(relative[:, :3, :3])
@@ -418,15 +397,11 @@ def _regressed(observations: Observations, along: Array, count: int) -> CurveMot
 def _with_knots(motion: CurveMotion, count: int, ends: tuple[float, float] | None = None) -> CurveMotion:
     """Return a curve with other knots, evenly distributed over the length from one end to the other."""
     at = np.linspace(*(ends or (motion.spline.first, motion.spline.last)), _SAMPLES * count)
-    poses = motion.linearise(at[:, None]).pose
-    steps = np.sum(np.diff(poses[:, :3, 3], axis=0) ** 2, axis=1)
-    if motion.rows == 6:
-        turns = log_so3(poses[1:, :3, :3] @ np.swapaxes(poses[:-1, :3, :3], 1, 2))
-        steps += motion.lever**2 * np.sum(turns**2, axis=1)
-    lengths = np.concatenate([[0.0], np.cumsum(np.sqrt(steps))])
+    steps = _steps_between(motion.linearise(at[:, None]).pose, motion.rows) * motion.lengths
+    lengths = np.concatenate([[0.0], np.cumsum(np.linalg.norm(steps, axis=1))])
     whole = max(float(lengths[-1]), 1e-6)
     knots = NaturalSpline(-0.5 * whole, whole / (count - 1), count)
-    weights = motion.spline.weights(np.interp(knots.knots + 0.5 * whole, lengths, at)).values
+    weights = motion.spline.weights(np.interp(knots.knots + 0.5 * whole, lengths, at))[0]
     new = weights @ motion.positions, weights @ motion.quaternions
     return CurveMotion.through(motion.rows, knots, *new, motion.whitening, motion.lever)
 
@@ -440,13 +415,14 @@ def _refine(
         solution = levenberg_marquardt(observations, motion, values, steps=_STEPS)
         rounds, used = rounds - 1, solution.values[:, 0]
         ends = float(used.min()), float(used.max())
-        if not rounds or ends[1] - ends[0] < 1e-3 * motion.length:
+        if not rounds or ends[1] - ends[0] < 1e-3 * (motion.spline.last - motion.spline.first):
             return solution
         motion = _with_knots(solution.motion, motion.spline.count, ends)
 
 
-def _nearest(observations: Observations, deviations: Array, motion: CurveMotion) -> Array:
+def _nearest(observations: Observations, deviations: Array, motion: FamilyMember) -> Array:
     """Return the joint value of the nearest point of a curve for each observation, (N, 1)."""
+    assert isinstance(motion, CurveMotion)
     at = np.linspace(motion.spline.first, motion.spline.last, _SAMPLES * motion.spline.count)
     relative = observations.relative
     observed = _whitened(relative, relative, deviations)

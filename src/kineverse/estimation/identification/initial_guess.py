@@ -107,7 +107,7 @@ def initial_guesses(name: str, statistics: MotionStatistics) -> Iterator[Initial
         for rotation in (*statistics.axis_rotations, *cylinders):
             left, right, angles, along, slope = rotation
             if name == "screw":
-                yield _guess_screw_revolutions(group, rows, rotation)
+                yield from _guess_screw_revolutions(group, rows, rotation)
             values = angles[:, None] if name != "cylindrical" else np.column_stack([along, angles])
             yield InitialGuess(GroupMotion(group, rows, left, right, slope if group.pitch else 0.0), values)
 
@@ -180,15 +180,19 @@ def _slope(angles: Array, along: Array) -> float:
     return float(off @ along) / variance if variance > 0.0 else 0.0
 
 
-def _guess_screw_revolutions(group: JointFamily, rows: int, rotation: _AxisRotation) -> InitialGuess:
-    """Return a screw whose revolutions are counted along its displacement."""
+def _guess_screw_revolutions(
+    group: JointFamily, rows: int, rotation: _AxisRotation
+) -> Iterator[InitialGuess]:
+    """Yield a screw whose revolutions are counted along its displacement, if there are several."""
     order = np.argsort(rotation.along, kind="stable")
     unwrapped = np.empty_like(rotation.angles)
     unwrapped[order] = np.unwrap(rotation.angles[order])
+    if np.array_equal(unwrapped, rotation.angles):
+        return
     slope = _slope(unwrapped, rotation.along)
     right = rotation.right.copy()
     right[2, 3] += float(np.mean(rotation.along)) - slope * float(np.mean(unwrapped))
-    return InitialGuess(GroupMotion(group, rows, rotation.left, right, slope), unwrapped[:, None])
+    yield InitialGuess(GroupMotion(group, rows, rotation.left, right, slope), unwrapped[:, None])
 
 
 def _guess_about_point(group: JointFamily, statistics: MotionStatistics) -> InitialGuess:

@@ -241,8 +241,11 @@ def log_unwrapping_gain(solution: Solution[FamilyMember]) -> float:
     known = solve_per_observation(solution)
     values = known.values
     middle = math.atan2(float(np.sin(values).mean()), float(np.cos(values).mean()))
+    turns = np.round((values - middle) / math.tau)
+    if not turns.any():
+        return 0.0
     logs = []
-    for each in (known, replace(known, values=values - math.tau * np.round((values - middle) / math.tau))):
+    for each in (known, replace(known, values=values - math.tau * turns)):
         ranges = fit_joint_ranges(solution.motion, each)
         precision = float(np.sum(1.0 / (ranges.deviations[0] ** 2 + known.covariances[:, 0, 0])))
         # The evidence integrates over the mean, which is less certain with more revolutions.

@@ -12,8 +12,8 @@ linearisation is at the estimate. The result maximises the full likelihood with 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Generic, NamedTuple, TypeVar
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Generic, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -30,6 +30,9 @@ from .motion_functions import GeneratedMotion
 from .motion_model import FamilyMember, LinearisedPoses, MotionModel, ParameterPrior
 from .observations import Observations
 
+if TYPE_CHECKING:
+    from .marginal_likelihood import IntegratedValues
+
 M = TypeVar("M", bound=MotionModel)
 M_co = TypeVar("M_co", bound=MotionModel, covariant=True)
 
@@ -37,6 +40,7 @@ STEPS = 40
 # Predicted decrease of the cost at convergence: a hundredth of a standard deviation. Convergence is linear,
 # so two successive decreases also predict the next one.
 CLOSE = 1e-4
+ROUGH = 1e-2  # the same for a first solution: a tenth of a standard deviation
 
 
 @dataclass(frozen=True)
@@ -73,6 +77,8 @@ class Solution(Generic[M_co]):
     parent: Array  # most likely true poses of the parent, (N, 4, 4)
     joint_prior: JointValuePrior
     converged: bool  # True if the steps became small; else the solution is the best one so far
+    # The evidence, if it was computed along with the solution. A copy that differs has none.
+    integrated: IntegratedValues | None = field(default=None, init=False)
 
 
 @dataclass(frozen=True)
@@ -100,6 +106,7 @@ def levenberg_marquardt(
     parent: Array | None = None,
     joint_prior: JointValuePrior | None = None,
     steps: int = STEPS,
+    close: float = CLOSE,
 ) -> Solution[M]:
     """Return the maximum of the likelihood, from a start."""
     joint_prior = joint_prior or JointValuePrior.vague(motion.joints)
@@ -115,10 +122,10 @@ def levenberg_marquardt(
             continue
         trial, gain = reduced
         if trial.cost <= point.cost + 1e-12 * abs(point.cost):
-            converged = gain < CLOSE or gain * gain < CLOSE * before
+            converged = gain < close or gain * gain < close * before
             point, damping, before = trial, 0.1 * damping if damping > 1e-6 else 0.0, gain
         else:
-            converged, damping = gain < CLOSE, max(10.0 * damping, 1e-4)
+            converged, damping = gain < close, max(10.0 * damping, 1e-4)
         if converged or damping > 1e8:
             break
     at_end = point.residuals, point.covariance, point.linear, point.parent

@@ -74,8 +74,8 @@ _GAP = 0.3
 _FITTING, _FITTING_FACTOR, _COMPETITIVE = 1e-3, 1.3, 1e-6
 # Probability of slow residuals, and their share in χ², that refute a joint of unknown noise.
 _SYSTEMATIC, _SYSTEMATIC_SHARE = 1e-3, 0.7
-# Sizes of an unknown noise relative to its medians above which it may be motion, for joints with one value
-# and with several.
+# Sizes of an unknown noise relative to its medians above which it may be motion: of one under a frequent
+# family, and of one under a rare family or of both.
 _LARGE, _STRANGE = 10.0, 4.0
 _ROUNDS = 3  # largest number of classifications of outliers
 
@@ -274,17 +274,24 @@ def _unjustified(
     """Yield reasons why the best family is probable by its prior or a strange noise, not by the data."""
     name = _best_name(result, solutions)
     motion, (size, turn) = solutions[name].scored.solution.motion, solutions[name].noise.factors
-    if not data.stated and max(size, turn) > (_STRANGE if motion.joints > 1 else _LARGE):
+    largest = _LARGE if motion.name in ("rigid", "prismatic", "revolute") else _STRANGE
+    if not data.stated and (max(size, turn) > largest or min(size, turn) > _STRANGE):
         yield "the noise would be very large, so it may be a motion: state the noise"
+    if data.stated and motion.rows == 6:
+        return  # a stated noise and orientations bound the evidence of all families
     # From positions a tilt of the axis may stand for a pitch, so they have to exclude others by themselves.
     odds, rivals = SURE / (1.0 - SURE), result.probabilities.keys() - {motion.name}
     if motion.rows == 6:
-        odds, rivals = 1.0, rivals & {"screw", "cylindrical", "free"}
+        # By an unknown noise a free part may be any joint with large errors.
+        odds, rivals = 1.0, rivals & {"screw", "cylindrical", *(() if data.stated else ("free",))}
     prior = {one.scored.solution.motion.name: weights[name] for name, one in solutions.items()}
     evidence = {family: p / prior[family] for family, p in result.probabilities.items()}
     for rival in sorted(rivals, key=evidence.__getitem__, reverse=True)[:1]:
         if evidence[motion.name] < odds * evidence[rival]:
-            yield f"{rival} explains the observations as well, and is only rarer"
+            yield (
+                f"{rival} explains the observations as well, and is only rarer; "
+                "if it cannot be one, leave it out of the families"
+            )
 
 
 def _is_explained(curve: FamilySolution, solutions: FamilySolutions) -> bool:

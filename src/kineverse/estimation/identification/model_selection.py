@@ -79,9 +79,10 @@ def measure_fit(
     weights = np.broadcast_to(weights, solution.covariance.shape)
     weighted = np.swapaxes(by_joints, 1, 2) @ weights
     curvature = weighted @ by_joints + LITTLE * np.eye(motion.joints)
-    projected = weights - np.swapaxes(weighted, 1, 2) @ invert_matrices(curvature) @ weighted
+    gains = invert_matrices(curvature) @ weighted
+    projected = weights - np.swapaxes(weighted, 1, 2) @ gains
     residuals = solution.residuals
-    change = multiply_vectors(invert_matrices(curvature), multiply_vectors(weighted, residuals))
+    change = multiply_vectors(gains, residuals)
     left = residuals - multiply_vectors(by_joints, change)
     squares = float(np.sum(left * multiply_vectors(weights, left)))
     # The effective number of parameters that the observations determine rather than the prior. The
@@ -216,8 +217,6 @@ class _PrincipalMotion(GroupMotion):
         return tuple(range(self.joints))
 
 
-# Log evidence that a family may lack against one that it contains, by the prior of its further unknowns.
-_FAILED = 5.0
 # Least width of a motion along a principal direction, in standard deviations of its joint values.
 _USED = 2.0
 # A family is not refined if its log evidence is below that of the best by more than a constant and a term for
@@ -334,13 +333,11 @@ def _solve_inliers(data: IdentificationData, inliers: FamilyInliers) -> dict[Fam
         observations, solved = data.observations.select(rows), dict[FamilyName, NoiseSolution]()
         statistics = MotionStatistics(observations)
         for name in (name for name in names if np.array_equal(inliers[name], rows)):
-            found = attempt(observations, _starts(observations, name, statistics, data.unit))
-            # A family that is much less probable than one that it contains was not fitted well.
-            for narrower in (solved[one] for one in CONTAINED.get(name, ()) if one in solved):
-                if found.log_evidence < narrower.log_evidence - _FAILED:
-                    wider = attempt(observations, [widened_guess(str(name), narrower.scored.solution)])
-                    found = max(found, wider, key=lambda each: each.log_evidence)
-            solved[name] = found
+            starts = _starts(observations, name, statistics, data.unit)
+            # A family starts from those that it contains as well, so that its fit is at least as good.
+            narrower = (solved[one].scored.solution for one in CONTAINED.get(name, ()) if one in solved)
+            starts += [widened_guess(str(name), solution) for solution in narrower]
+            solved[name] = attempt(observations, starts)
         solutions |= solved
     return {name: solutions[name] for name in inliers}
 

@@ -9,8 +9,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import dataclass
 from typing import Self, TypeAlias
 
 import casadi as ca
@@ -146,12 +145,6 @@ class MotionForm:
     precision: Array
     # parameters that determine the mean pose together with the joint values; None if all parameters do
     movers: tuple[int, ...] | None = None
-
-    @cached_property
-    def fixed(self) -> MotionForm:
-        """Form of the same motion without parameters."""
-        joints = self.precision[len(self.parameters) :]
-        return replace(self, parameters=(), beliefs=(), precision=joints, movers=None)
 
 
 class GeneratedMotion(ABC):

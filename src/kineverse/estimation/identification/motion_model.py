@@ -10,7 +10,7 @@ import numpy as np
 from kineverse.lie import Array
 
 if TYPE_CHECKING:
-    from .motion_functions import MotionForm
+    pass
 
 
 class LinearisedPoses(NamedTuple):
@@ -93,22 +93,6 @@ class FixedMotion:
     def joints(self) -> int:
         """Number of joint values."""
         return self.motion.joints
-
-    @property
-    def form(self) -> MotionForm | None:
-        """Form of the motion if it is generated."""
-        form: MotionForm | None = getattr(self.motion, "form", None)
-        return None if form is None else form.fixed
-
-    @property
-    def state(self) -> Array:
-        """State of the motion, if it is generated."""
-        state: Array = self.motion.state  # type: ignore[attr-defined]
-        return state
-
-    def with_state(self, state: Array) -> Self:
-        """Return itself: the state is fixed."""
-        return self
 
     def linearise(self, values: Array) -> LinearisedPoses:
         """Return the poses at joint values (N, k) and their derivatives."""

@@ -59,7 +59,7 @@ def _declare(code: Any) -> None:
     pointer, counter, number = ctypes.c_void_p, ctypes.c_int64, ctypes.c_double
     code.memory_of.argtypes, code.memory_of.restype = (counter,), counter
     code.evaluate.argtypes = (pointer, counter, *(pointer,) * 5)
-    code.solve.argtypes = (pointer, counter, pointer, pointer)
+    code.solve.argtypes = (pointer, counter, pointer, counter, counter, pointer, pointer)
     code.rate.argtypes = (pointer, counter, pointer, pointer, number, *(pointer,) * 8)
     for function in (code.evaluate, code.solve, code.rate):
         function.restype = None

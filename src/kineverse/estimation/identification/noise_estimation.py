@@ -224,7 +224,7 @@ def adapt_noise(
             scored, rough = solver.maximise_marginal_likelihood(scaled, solution), False
         else:
             start = InitialGuess(solution.motion, solution.values), solution.parent, solution.joint_prior
-            scored = solver.continue_from(scaled, *start, len(observations))
+            scored = solver.continue_from(scaled, *start)
         solution, used = scored.solution, logs
         search = _NoiseSearch(observations, solution)
         mode = search.maximise(logs, root)

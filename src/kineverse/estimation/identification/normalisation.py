@@ -40,12 +40,10 @@ def convert_to_unit(observations: Observations, unit: float) -> Observations:
     if unit == 1.0:
         return observations
     scale = np.array([1.0 / unit] * 3 + [1.0] * 3)
-    by = np.outer(scale, scale)
-    rounding = np.diag([_ROUNDING**2] * 3 + [0.0] * 3)
-    of_parent = observations.parent_covariance
-    of_parent = None if of_parent is None else of_parent * by + rounding
-    rows = observations.rows
-    of_child = observations.child_covariance * by[:rows, :rows] + rounding[:rows, :rows]
+    scaled = observations.scaled(np.outer(scale, scale))
+    rounding, rows = np.diag([_ROUNDING**2] * 3 + [0.0] * 3), observations.rows
+    of_parent = None if scaled.parent_covariance is None else scaled.parent_covariance + rounding
+    of_child = scaled.child_covariance + rounding[:rows, :rows]
     parent, child = (_scale_positions(p, 1.0 / unit) for p in (observations.parent, observations.child))
     return Observations(parent, child, of_parent, of_child)
 

@@ -59,23 +59,18 @@ class Observations:
         They are the levels of a continuation. If positions are much more precise than orientation errors
         times the lever, the likelihood is a narrow and curved valley, which Gauss-Newton steps do not enter.
         """
-        each = (np.array([factor] * 3 + [1.0] * 3) for factor in self.softness)
-        return tuple(self.scaled(np.outer(factors, factors)) for factors in each)
-
-    @cached_property
-    def softness(self) -> tuple[float, ...]:
-        """Factors on the position errors of each level of :attr:`softened`."""
         if self.parent_covariance is None:
             return ()
         lever = float(np.sqrt(np.mean(np.sum(self.relative[:, :3, 3] ** 2, axis=1))))
         turned = lever * float(np.sqrt(np.mean(np.einsum("nii->ni", self.parent_covariance)[:, 3:])))
         place = float(np.sqrt(np.mean(np.einsum("nii->ni", self.child_covariance)[:, :3])))
-        factors, factor = [], 0.5 * turned / place
+        levels, factor = [], 0.5 * turned / place
         # The margin keeps rounding from adding a level to observations that are softened already.
         while factor > _THIN * (1.0 + 1e-9):
-            factors.append(factor)
+            factors = np.array([factor] * 3 + [1.0] * 3)
+            levels.append(self.scaled(np.outer(factors, factors)))
             factor /= _THIN
-        return tuple(factors)
+        return tuple(levels)
 
 
 def check_observations(

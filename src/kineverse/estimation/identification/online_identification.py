@@ -53,7 +53,7 @@ def warm_start(
                 values[k] += math.tau * np.round((values[k - 1] - values[k]) / math.tau)
         parent = np.concatenate([before.parent, observations.parent[first:]])
         start = InitialGuess(before.motion, values), parent, before.joint_prior
-        scored = solver.continue_from(scale_noise(observations, one.noise.factors), *start, first)
+        scored = solver.continue_from(scale_noise(observations, one.noise.factors), *start)
         solutions[name] = NoiseSolution(scored, one.noise)
     return score_solutions(data, solutions, inliers, weights, renew)
 

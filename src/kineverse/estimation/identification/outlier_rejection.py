@@ -1,12 +1,10 @@
 """Inlier classification of observations for each joint family.
 
 An observation is an inlier with the probability 1 - ε, else it is uniformly distributed (:class:`.Outliers`).
-Outliers bias the most likely member of a family, and then inliers look like outliers. So the search is
-annealed by graduated non-convexity (Yang et al. 2020, with the weights of Geman and McClure). It starts with
-a loss that tolerates all errors and reduces the tolerance step by step. A weight w divides the covariances of
-an observation's errors by w. In the end, observations that are more probable under the uniform density are
-outliers. Each family also tries the inliers of the other families, and the half of the observations with the
-nearest neighbours.
+Outliers bias the most likely member of a family, and then inliers look like outliers. So each family is
+solved from the half of the observations with the nearest neighbours, and from the inliers of the other
+families. All observations are then classified and the inliers solved again until they stay the same. A weight
+w divides the covariances of an observation's errors by w.
 
 A family with outliers in half of the observations explains nothing. It is evaluated with all of them as
 inliers.
@@ -24,7 +22,7 @@ import numpy as np
 import numpy.typing as npt
 
 from kineverse.estimation.linear_algebra import invert_matrices
-from kineverse.estimation.noise import CHI_SQUARED_6, Outliers
+from kineverse.estimation.noise import Outliers
 from kineverse.lie import Array
 
 from .least_squares import STEPS, InitialGuess, JointValuePrior, Solution
@@ -38,10 +36,7 @@ UNEVEN = 3.0  # factor by which the noise may vary between observations if its s
 RowIndices: TypeAlias = "npt.NDArray[np.int_]"
 Name = TypeVar("Name")
 
-# 99.9 % quantile of χ² of poses and of positions, the final tolerance of the annealing.
-_CHI_SQUARED = {6: CHI_SQUARED_6, 3: 16.3}
-# Factor on the tolerance in each round of the annealing, and solver steps of a round.
-_ANNEALING, _FEW_STEPS = 2.0, 6
+_FEW_STEPS = 6  # of the solver in the first round
 # Largest number of rounds of reclassification, and of inlier sets that are shared between families.
 _ROUNDS, _SHARED = 5, 3
 _NEIGHBOURS = 2  # index of the neighbour whose distance measures isolation
@@ -83,8 +78,6 @@ def find_inliers(
     # Where one path explains all observations, no family gains by leaving some out.
     if not unsettled or not all(name in unsettled for name in simple):
         return dict.fromkeys(solutions, everything)
-    for name in unsettled:
-        hypotheses[name] = search.anneal(hypotheses[name])
     supported = Counter(tuple(h.inliers) for h in hypotheses.values() if h.has_enough_inliers)
     common = [np.flatnonzero(inliers) for inliers, _ in supported.most_common(_SHARED)]
     # Evenly spaced rows.
@@ -175,27 +168,15 @@ class _InlierSearch:
         return motion.joints == self.observations.rows or (self.stated and bool(hypothesis.inliers.all()))
 
     def hypothesis(self, solution: Solution[FamilyMember], weights: Array | None = None) -> _InlierHypothesis:
-        squares, log_scale = self._whitened_errors(solution, weights)
+        covariance = solution.covariance if weights is None else solution.covariance * weights[:, None, None]
+        freedom = self.observations.rows - solution.motion.joints
+        squares, log_scale = _whiten(solution.residuals, covariance, self.stated or not freedom, freedom)
         log_inlier = math.log(1.0 - self.outliers.fraction) - 0.5 * squares - log_scale
         log_outlier = _log_outlier_density(self.outliers, self.observations.rows)
         log = float(np.sum(np.maximum(log_inlier, log_outlier)))
         inliers = log_inlier > log_outlier
         next_weights = np.where(inliers, 1.0, 1.0 / np.maximum(squares, 1.0))
         return _InlierHypothesis(inliers, solution, log, next_weights)
-
-    def anneal(self, hypothesis: _InlierHypothesis) -> _InlierHypothesis:
-        """Return the hypothesis that graduated non-convexity reaches from a first one."""
-        solution, quantile = hypothesis.solution, _CHI_SQUARED[self.observations.rows]
-        squares, _ = self._whitened_errors(solution, None)
-        tolerance = max(1.0, 2.0 * float(squares.max()) / quantile)
-        while True:
-            tolerated = tolerance * quantile
-            weights = np.maximum((tolerated / (squares + tolerated)) ** 2, _LEAST_WEIGHT)
-            solution = self._solve(solution.motion, solution.values, solution.parent, weights, _FEW_STEPS)
-            if tolerance == 1.0:
-                return self._iterate(self.hypothesis(solution, weights))
-            squares, _ = self._whitened_errors(solution, weights)
-            tolerance = max(1.0, tolerance / _ANNEALING)
 
     def grow(self, subset: Solution[FamilyMember], rows: RowIndices) -> _InlierHypothesis:
         """Return the hypothesis that the solution of some of the observations leads to."""
@@ -207,9 +188,7 @@ class _InlierSearch:
         weights = np.full(len(observations), _LEAST_WEIGHT)
         weights[rows] = 1.0
         solution = self._solve(subset.motion, values, parent, weights, _FEW_STEPS)
-        return self._iterate(self.hypothesis(solution, weights))
-
-    def _iterate(self, hypothesis: _InlierHypothesis) -> _InlierHypothesis:
+        hypothesis = self.hypothesis(solution, weights)
         for _ in range(_ROUNDS):
             if not hypothesis.has_enough_inliers:
                 break
@@ -226,13 +205,3 @@ class _InlierSearch:
         weighted = self.observations.scaled((1.0 / weights)[:, None, None])
         vague = JointValuePrior.vague(motion.joints)
         return solver.solve(weighted, InitialGuess(motion, values), parent, vague, steps)
-
-    def _whitened_errors(
-        self, solution: Solution[FamilyMember], weights: Array | None
-    ) -> tuple[Array, Array]:
-        """Return squared norms of the whitened errors, and ½ log |2πS|, (N,)."""
-        covariance = solution.covariance
-        if weights is not None:
-            covariance = covariance * weights[:, None, None]
-        freedom = self.observations.rows - solution.motion.joints
-        return _whiten(solution.residuals, covariance, self.stated or not freedom, freedom)

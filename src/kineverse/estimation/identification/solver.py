@@ -12,7 +12,8 @@ import math
 import threading
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any
+from functools import partial
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -22,7 +23,7 @@ from kineverse.lie import Array
 from . import joint_values, native
 from .families import prepare_functions
 from .joint_values import PerObservation, has_sliding_point, narrow_translations
-from .least_squares import CLOSE, STEPS, InitialGuess, JointValuePrior, Solution, levenberg_marquardt
+from .least_squares import CLOSE, ROUGH, STEPS, InitialGuess, JointValuePrior, Solution, levenberg_marquardt
 from .marginal_likelihood import (
     Evidence,
     IntegratedValues,
@@ -32,15 +33,17 @@ from .marginal_likelihood import (
     integrate_joint_values,
 )
 from .motion_functions import GeneratedMotion, MotionForm
-from .motion_model import FamilyMember, FixedMotion, LinearisedPoses, MotionModel
+from .motion_model import FamilyMember, LinearisedPoses, MotionModel
 from .native import Problem, library
 from .observations import Observations
 
 _FIRST_STEPS = 2  # steps of each of several starts, before the best of them continues
-_TURNS, _SETTLED = 8, 0.01  # rounds of ranges and solutions, and change of the log widths at convergence
+# Rounds of ranges and solutions, steps of each, and change of the log widths at convergence.
+_TURNS, _TURN_STEPS, _SETTLED = 8, 10, 0.01
 _NARROWEST = 1e-4  # least width of a range [m], [rad]
 _KEPT = 4_000_000  # largest number of doubles of a work memory that is kept between calls
 _ONE = np.ones((1, 2))
+Shapes: TypeAlias = tuple[tuple[int, ...], ...]
 _GIVEN = "parent", "child", "parent_covariance", "child_covariance"
 
 
@@ -66,20 +69,14 @@ class IdentificationSolver:
         steps: int = STEPS,
     ) -> Solution[FamilyMember]:
         """Return the maximum of the likelihood, from a start."""
-        motion, values = start
-        problem = _problem(motion)
-        if problem is None:
-            return levenberg_marquardt(observations, motion, values, parent, joint_prior, steps)
-        return _solve(problem, observations, motion, values, parent, joint_prior, steps)
+        return _solve(observations, [start], parent, joint_prior, steps)
 
     def maximum_likelihood(self, observations: Observations, starts: Sequence[InitialGuess]) -> Scored:
         """Return the maximum of the likelihood in a family, from the start that is best after a few steps."""
         first, *softer = [*observations.softened, observations]
         joint_prior = JointValuePrior.vague(starts[0].motion.joints)
-        steps = _FIRST_STEPS if len(starts) > 1 else STEPS
-        begun = [self.solve(first, start, first.parent, joint_prior, steps) for start in starts]
-        solution = min(begun, key=lambda each: each.cost)
-        for narrower in ([] if solution.converged or steps == STEPS else [first]) + softer:
+        solution = _solve(first, starts, first.parent, joint_prior, close=ROUGH)
+        for narrower in softer:
             solution = self._proceed(narrower, solution, joint_prior)
         return self._score(self._narrow(solution))
 
@@ -113,25 +110,14 @@ class IdentificationSolver:
                 break
             before = widths
             prior = JointValuePrior(integrated.mean, widths**-2.0, marginal=True)
-            solution = self._proceed(observations, solution, prior)
+            solution = self._proceed(observations, solution, prior, _TURN_STEPS)
         return self._score(solution, integrated)
 
     def continue_from(
-        self,
-        observations: Observations,
-        start: InitialGuess,
-        parent: Array,
-        joint_prior: JointValuePrior,
-        known: int,
+        self, observations: Observations, start: InitialGuess, parent: Array, joint_prior: JointValuePrior
     ) -> Scored:
-        """Return the solution of more observations than ``known``, continued from an earlier one."""
-        motion, values = start
-        if known < len(observations):
-            new, values, parent = slice(known, None), values.copy(), parent.copy()
-            fixed = InitialGuess(FixedMotion(motion), values[new])  # type: ignore[arg-type]
-            projected = self.solve(observations.select(new), fixed, parent[new], joint_prior)
-            values[new], parent[new] = projected.values, projected.parent
-        solution = self._narrow(self.solve(observations, InitialGuess(motion, values), parent, joint_prior))
+        """Return the solution that continues an earlier one."""
+        solution = self._narrow(self.solve(observations, start, parent, joint_prior))
         if joint_prior.marginal:
             return self.maximise_marginal_likelihood(observations, solution)
         return self._score(solution)
@@ -161,16 +147,22 @@ class IdentificationSolver:
         return narrow_translations(solution, self._integrate(solution).alone)
 
     def _proceed(
-        self, observations: Observations, solution: Solution[FamilyMember], joint_prior: JointValuePrior
+        self,
+        observations: Observations,
+        solution: Solution[FamilyMember],
+        joint_prior: JointValuePrior,
+        steps: int = STEPS,
     ) -> Solution[FamilyMember]:
         start = InitialGuess(solution.motion, solution.values)
-        return self.solve(observations, start, solution.parent, joint_prior)
+        return _solve(observations, [start], solution.parent, joint_prior, steps)
 
     def _score(self, solution: Solution[FamilyMember], integrated: IntegratedValues | None = None) -> Scored:
         integrated = integrated or self._integrate(solution)
         return Scored(solution, float(integrated.logs[-1]) - evidence_excess(solution, integrated.alone))
 
     def _integrate(self, solution: Solution[FamilyMember], weight: float = 1.0) -> IntegratedValues:
+        if weight == 1.0 and solution.integrated is not None:
+            return solution.integrated
         problem = _problem(solution.motion)
         if problem is None:
             return integrate_joint_values(solution, weight)
@@ -183,55 +175,76 @@ solver = IdentificationSolver()
 def _problem(motion: MotionModel) -> Problem | None:
     """Return the C structure of a motion's family; None for numpy."""
     form: MotionForm | None = getattr(motion, "form", None)
-    problem = None if form is None or not library.is_native else native.problem_of(form)
-    return None if problem is None else Problem.from_buffer_copy(problem)
+    known = None if form is None or not library.is_native else native.problem_of(form)
+    if known is None:
+        return None
+    problem, grid = Problem.from_buffer_copy(known), joint_values.GRID
+    problem.little, problem.widths, problem.grid = joint_values.LITTLE, len(grid), grid.ctypes.data
+    return problem
 
 
 def _solve(
-    problem: Problem,
     observations: Observations,
-    motion: FamilyMember,
-    values: Array,
+    starts: Sequence[InitialGuess],
     parent: Array,
     joint_prior: JointValuePrior,
-    steps: int,
+    steps: int = STEPS,
+    close: float = CLOSE,
 ) -> Solution[FamilyMember]:
-    assert isinstance(motion, (GeneratedMotion, FixedMotion))  # others have no C structure
+    """Return the maximum of the likelihood, from the start that is best after a few steps."""
+    motion: Any = starts[0].motion
+    problem = _problem(motion)
+    if problem is None:
+        run = partial(levenberg_marquardt, observations, joint_prior=joint_prior, close=close)
+        few = _FIRST_STEPS if len(starts) > 1 else steps
+        solutions = [run(*start, parent, steps=few) for start in starts]
+        best = min(solutions, key=lambda each: each.cost)
+        if len(starts) == 1 or best.converged:
+            return best
+        return run(best.motion, best.values, best.parent, steps=steps)
     count, joints = len(observations), problem.joints
-    problem.count, problem.close, problem.marginal = count, CLOSE, joint_prior.marginal
+    problem.count, problem.close, problem.marginal = count, close, joint_prior.marginal
     given = [(name, getattr(observations, name)) for name in _GIVEN]
     kept = [(name, np.ascontiguousarray(array)) for name, array in given if array is not None]
     for name, array in kept:
         setattr(problem, name, array.ctypes.data)
-    problem.mean[:joints], problem.precision[:joints] = joint_prior.mean, joint_prior.precision
-    size, states, *parts = _layout(count, problem.states, problem.rows, problem.size, joints)
-    answer = np.empty(size)
-    answer[states] = motion.state
-    arrays = [answer[part].reshape(shape) for part, shape in parts]
-    arrays[0][:], arrays[1][:] = values, parent
-    _call(library.code.solve, problem, steps, _memory.reserve(count), answer)
-    values, parent, residuals, covariance, *linear = arrays
-    return Solution(
-        motion=motion.with_state(answer[states]),
-        values=values,
-        cost=float(answer[0]),
-        residuals=residuals,
-        covariance=covariance,
-        linear=LinearisedPoses(*linear),
-        parent=parent,
-        joint_prior=joint_prior,
-        converged=bool(answer[1]),
-    )
+    problem.mean[:joints] = joint_prior.mean.tolist()
+    problem.precision[:joints] = joint_prior.precision.tolist()
+    generated: Sequence[tuple[Any, Array]] = starts
+    begin = np.concatenate([part for each, values in generated for part in (each.state, values.ravel())])
+    memory = _memory.reserve(count)
+    shapes = _shapes(count, problem.states, problem.rows, problem.size, joints)
+    answer, arrays = _reserve(shapes)
+    head, state, values, at_end, residuals, covariance, *linear, logs = arrays[:10]
+    at_end[:] = parent
+    _call(library.code.solve, problem, len(starts), begin, _FIRST_STEPS, steps, memory, answer)
+    motion = motion.with_state(state)
+    rest = residuals, covariance, LinearisedPoses(*linear), at_end, joint_prior, bool(head[1])
+    solution = Solution(motion, values, float(head[0]), *rest)
+    solution.__dict__["integrated"] = _integrated(motion, logs, arrays[10:])
+    return solution
 
 
 @functools.lru_cache(maxsize=256)
-def _layout(count: int, states: int, rows: int, size: int, joints: int) -> tuple[Any, ...]:
-    """Return the size of a solution in C, the slice of its state, and slices and shapes of its arrays."""
+def _shapes(count: int, states: int, rows: int, size: int, joints: int) -> Shapes:
+    """Return shapes of a solution in C: two numbers, state, seven of observations, and its integral."""
     each = (joints,), (4, 4), (rows,), (rows, rows), (4, 4), (rows, size), (rows, joints)
-    shapes = [(count, *shape) for shape in each]
-    ends = [*itertools.accumulate(map(math.prod, shapes), initial=2 + states)]
-    parts = (slice(*pair) for pair in itertools.pairwise(ends))
-    return ends[-1], slice(2, 2 + states), *zip(parts, shapes, strict=True)
+    n = size + joints
+    integral = (1,), (joints,), (joints,), (n, n), *((count, joints),) * 2, *((count, joints, joints),) * 2
+    return (2,), (states,), *((count, *shape) for shape in each), (1,), *integral
+
+
+@functools.lru_cache(maxsize=256)
+def _slices(shapes: Shapes) -> tuple[slice, ...]:
+    ends = itertools.accumulate(map(math.prod, shapes), initial=0)
+    return tuple(slice(*pair) for pair in itertools.pairwise(ends))
+
+
+def _reserve(shapes: Shapes) -> tuple[Array, list[Array]]:
+    """Return memory, and the arrays in it."""
+    parts = _slices(shapes)
+    numbers = np.empty(parts[-1].stop)
+    return numbers, [numbers[part].reshape(shape) for part, shape in zip(parts, shapes, strict=True)]
 
 
 def _integrate(
@@ -239,28 +252,24 @@ def _integrate(
     solution: Solution[FamilyMember],
     weight: float,
     factors: Array = _ONE,
-    parts: Array | None = None,
+    covariances: Array | None = None,
 ) -> IntegratedValues:
-    motion, (count, k), grid = solution.motion, solution.values.shape, joint_values.GRID
+    motion, problem.count = solution.motion, len(solution.values)
     assert isinstance(motion, GeneratedMotion)  # others have no C structure
-    problem.count, problem.little = count, joint_values.LITTLE
-    problem.widths, problem.grid = len(grid), grid.ctypes.data
-    n = problem.size + k
-    ends = [*itertools.accumulate((k, k, n * n, *(count * k,) * 2, *(count * k * k,) * 2), initial=1)]
-    logs, numbers = np.empty(len(factors)), np.empty(ends[-1])
+    shapes = _shapes(problem.count, problem.states, problem.rows, problem.size, problem.joints)
+    answer, arrays = _reserve(shapes[10:])
+    logs = np.empty(len(factors))
     given = motion.state, solution.values, solution.residuals, solution.covariance, solution.linear.by_joints
-    memory = _memory.reserve(count)
-    _call(library.code.rate, problem, len(factors), factors, parts, weight, memory, *given, logs, numbers)
-    parted = (numbers[slice(*pair)] for pair in itertools.pairwise(ends))
-    deviations, mean, information, *values = parted
-    alone, posterior, alone_covariances, covariances = (
-        each.reshape(shape)
-        for each, shape in zip(values, [(count, k)] * 2 + [(count, k, k)] * 2, strict=True)
-    )
-    return IntegratedValues(
-        logs + motion.log_density(), deviations, mean, information.reshape(n, n),
-        PerObservation(alone, alone_covariances, float(numbers[0])), posterior, covariances,
-    )  # fmt: skip
+    work = weight, _memory.reserve(problem.count)
+    _call(library.code.rate, problem, len(factors), factors, covariances, *work, *given, logs, answer)
+    return _integrated(motion, logs, arrays)
+
+
+def _integrated(motion: GeneratedMotion, logs: Array, arrays: Sequence[Array]) -> IntegratedValues:
+    log_likelihood, deviations, mean, information, alone, values, covariances, posterior = arrays
+    single = PerObservation(alone, covariances, float(log_likelihood[0]))
+    logs = logs + motion.log_density()
+    return IntegratedValues(logs, deviations, mean, information, single, values, posterior)
 
 
 def _call(function: Callable[..., None], problem: Problem, *arguments: Array | float | None) -> None:

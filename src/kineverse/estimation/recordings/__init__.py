@@ -17,7 +17,6 @@ if TYPE_CHECKING:
         RecordedPair as RecordedPair,
         RecordedTrack as RecordedTrack,
         Recording as Recording,
-        spaced_indices as spaced_indices,
     )
 
 lazy_face(__name__)

@@ -25,6 +25,8 @@ ORIENTATIONS = (
 )
 """Representations of an orientation, with their columns. The last two are read only if no other is there."""
 
+YAW = "yaw"  # the orientation of a motion in the plane
+
 UNNAMED_COLUMNS: Mapping[str, str] = MappingProxyType(
     {
         "nnn": "x,y,z",
@@ -76,6 +78,7 @@ _PATTERNS = tuple(
         "(?:q|quat|quaternion|rot|rotation|orientation)[./:_ ]?([xyzw])": "q{}",
         "(?:rvec|rotvec|rotation_vector)[./:_ ]?([xyz])": "r{}",
         "(?:(?:rot|rotation|orientation|euler|rpy)[./:_ ])?(roll|pitch|yaw)": "{}",
+        "(theta|heading)": "yaw",
         "(x|y|z|q[xyzw0-4]|r[xyzw]|r[1-3][1-3])": "{}",
     }.items()
 )
@@ -147,9 +150,9 @@ def _parse_name(name: str) -> ColumnMeaning:
 class PartColumns:
     """Columns of one part."""
 
-    position: tuple[int, ...]  # x, y and z
+    position: tuple[int, ...]  # x, y and z; x and y of a motion in the plane
     orientation: tuple[int, ...] = ()
-    form: str = ""  # one of ORIENTATIONS, or ""
+    form: str = ""  # one of ORIENTATIONS, YAW, or ""
 
 
 @dataclass(frozen=True)
@@ -212,6 +215,10 @@ def _parse_part(
 ) -> PartColumns:
     owner = f"{where}: the part '{part}' has" if part else f"{where}: the table has"
     left = {quantity for owner, quantity in places if owner == part}
+    if left - {"z"} == {"x", "y", "yaw"}:
+        return PartColumns(
+            tuple(places[part, axis] for axis in POSITION if axis in left), (places[part, "yaw"],), YAW
+        )
     found: dict[str, tuple[int, ...]] = {}
     for form, quantities in (("position", POSITION), *ORIENTATIONS):
         if left.issuperset(quantities):
@@ -224,6 +231,10 @@ def _parse_part(
         wanted = (POSITION, *(names for _, names in ORIENTATIONS))
         missing = min(({*names} - left for names in wanted if left & {*names}), key=len)
         hint = f" Not understood: {_format_list(ignored)}." if ignored else ""
+        if missing == {"qw"} and not left & {*POSITION} and position is None:
+            raise FormatError(
+                f"{owner} no positions x, y, z, and no qw, the fourth number of the quaternion."
+            )
         if missing == {"qw"}:
             hint = " Three angles are called roll, pitch, yaw, and a rotation vector rx, ry, rz."
         raise FormatError(f"{owner} no column {', '.join(sorted(missing))}.{hint} {COLUMN_HELP}")

@@ -21,6 +21,7 @@ from .columns import (
     UNITS,
     UNNAMED_COLUMNS,
     UNORDERED,
+    YAW,
     Columns,
     PartColumns,
     parse_columns,
@@ -39,6 +40,7 @@ _FEWEST_ROWS, _MOST_ROWS = 8, 200  # that decide
 _TINY = 1e-4  # misfit that makes no difference, relative to the motion
 _STILL = 0.05  # rotation that makes no difference [rad]
 _EPOCHS = ((1e17, "ns"), (1e14, "us"), (1e11, "ms"))  # times without a unit that are this large
+_ABOUT_Z = (0.0, 0.0, 1.0)
 _GAPS = {"", "nan", "na", "n/a", "null", "none", "<na>"}
 
 
@@ -80,6 +82,7 @@ READINGS: Mapping[str, Mapping[str, Reading]] = MappingProxyType(
         UNORDERED: {"qx,qy,qz,qw": quaternion, "qw,qx,qy,qz": lambda q: quaternion(np.roll(q, -1, axis=-1))},
         "matrix": {"": lambda numbers: quaternion(to_quaternion(numbers.reshape(-1, 3, 3)))},
         "rpy": {"rad": rpy, "deg": lambda angles: rpy(np.radians(angles))},
+        YAW: {"rad": lambda yaw: rpy(yaw * _ABOUT_Z), "deg": lambda yaw: rpy(np.radians(yaw) * _ABOUT_Z)},
         "rotation vector": {"rad": exp_so3, "deg": lambda vectors: exp_so3(np.radians(vectors))},
     }
 )
@@ -106,7 +109,12 @@ class _Reader:
             raise FormatError(f"{source}: nothing was observed in any row.")
         poses = {name: self._parse_numbers(where.position, rows) for name, (where, rows) in found.items()}
         scale = self._length_unit([*poses.values()])
-        poses = {name: scale * positions for name, positions in poses.items()}
+        poses = {
+            name: scale * np.pad(positions, ((0, 0), (0, 3 - positions.shape[1])))
+            for name, positions in poses.items()
+        }
+        for where in (where for where, _ in found.values() if where.form == YAW):
+            self.assumed.append("roll = pitch = 0" if len(where.position) == 3 else "z = roll = pitch = 0")
         for form in {where.form: None for where, _ in found.values() if where.form}:
             numbers = {}
             for name, (where, rows) in found.items():

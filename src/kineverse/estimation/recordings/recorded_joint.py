@@ -38,7 +38,6 @@ from kineverse.model.basic_operations import SetBody
 from kineverse.model.body import Body, Rgba, Shape, Sphere
 from kineverse.model.frame import WORLD
 from kineverse.model.model import Model
-from kineverse.model.operation import Operation
 from kineverse.spatial import translation
 
 from .recording import Indices, RecordedPair, spaced_indices
@@ -87,12 +86,9 @@ class Assumption:
 
 
 @dataclass(frozen=True, eq=False)
-class RecordedJoint:
-    """Joint identified from a recorded pair."""
+class RecordedJoint(Assumption):
+    """Joint identified from a recorded pair, with the assumption under which the answer was found."""
 
-    found: IdentificationResult  # all families, with their probabilities
-    noise: ObservationNoise  # of single observations
-    correlation_time: float  # autocorrelation time of their errors, in rows
     repeated: int  # number of rows that equal the one before; they do not count
     judged: int  # effective sample size by which the families were compared
     fit: Fit  # of the most probable family to all poses, outliers marked
@@ -115,30 +111,24 @@ def identify_recorded_joint(
     families: list[str] | None = None,
     independent: bool = False,
 ) -> RecordedJoint:
-    """Identify the joint of a recorded pair.
+    """Identify the joint of a recorded pair by the noise of its poses; without one, estimate it.
 
-    Parameters
-    ----------
-    pair
-        Poses in their order.
-    noise
-        Noise of single observations; None if it is to be estimated.
-    families
-        Names of families; None for all.
-    independent
-        True if all errors are independent. Else their autocorrelation is estimated.
-
-    Raises
-    ------
-    InvalidValueError
-        If all poses are equal, or do not allow an identification.
+    Independent errors have no autocorrelation, which is else estimated.
     """
     comparison = _Comparison(pair, families, independent)
+    if noise is None and pair.is_in_plane:
+        what = "roll and pitch" if pair.relative.ndim == 3 else "z"
+        raise InvalidValueError(
+            f"All poses have the same {what}, so the noise cannot be estimated: a joint "
+            "in the plane explains all of these poses without any. State it (--noise 3mm,1deg on the command "
+            "line)."
+        )
     first = comparison.assume(noise, 1.0, comparison.distinct)
     fits = {}
     if not independent:
         # If the stated noise is too small, most observations are outliers.
-        estimated = first if noise is None else comparison.assume(None, 1.0, comparison.distinct)
+        as_stated = noise is None or pair.is_in_plane
+        estimated = first if as_stated else comparison.assume(None, 1.0, comparison.distinct)
         fits = {fit.family: fit for fit in estimated.found if fit.family not in ("free", CURVE)}
     times = {name: comparison.correlation_time(fit) for name, fit in fits.items()}
     best, rows = first, comparison.distinct
@@ -153,9 +143,9 @@ def identify_recorded_joint(
     others = comparison.alternatives(noise, best, fits, times, rows)
     count = len(comparison.distinct)
     return RecordedJoint(
-        best.found,
         best.noise,
         best.correlation_time,
+        best.found,
         repeated=len(pair.lines) - count,
         judged=max(1, round(count / best.correlation_time)),
         fit=comparison.complete(best, rows),
@@ -244,7 +234,7 @@ class _Comparison:
                 if other.found.best.family == name:
                     yield other
         noises = [best.noise.scaled(2.0)]
-        if stated is not None:
+        if stated is not None and not self.pair.is_in_plane:
             noises.append(self.assume(None, best.correlation_time, rows).noise)
         others = [self.assume(noise, best.correlation_time, rows) for noise in noises]
         known = self.assume(best.noise, best.correlation_time, rows) if stated is None else best
@@ -296,8 +286,7 @@ def log_probability(result: IdentificationResult) -> float:
 
 
 _ORANGE: Rgba = (0.93, 0.56, 0.17, 1.0)
-
-_DOTS = 60  # largest number of observed poses drawn in the model
+_DOTS = 60  # largest number of observed positions drawn in the model
 
 
 def make_joint_model(pair: RecordedPair, fit: Fit) -> Model:
@@ -306,62 +295,46 @@ def make_joint_model(pair: RecordedPair, fit: Fit) -> Model:
     If only positions are observed, the child's axes are those of its parent at joint value 0. Such a part
     that moves freely has no joint.
     """
-    if fit.family == "free" and fit.motion.rows == 3:
+    motion, names = fit.motion, (pair.child, pair.parent, pair.child)
+    if motion.rows == 6 or fit.family == CURVE:
+        operation = fit.operation(*names, as_point=True)
+    elif fit.family == "free":
         raise InvalidValueError(f"'{pair.child}' moves freely: there is no joint to write.")
-    model = Model()
+    else:
+        right = motion.right.copy()
+        right[:3, :3] = motion.left[:3, :3].T
+        limits = [(float(low), float(high)) for low, high in fit.range]
+        operation = joint_operation(replace(motion, right=right), limits, *names)
     positions = pair.relative[:, :3, 3] if pair.relative.ndim == 3 else pair.relative
     size = max(float(np.ptp(positions, axis=0).max()), 0.01)
+    known = {name: np.asarray(value) for name, value in fit.parameters.items()}
+
+    def nearest(position: Array) -> Array:
+        """Return the point of the axis closest to a position; the position itself of a slider."""
+        point = known.get("point", position)
+        return np.asarray(point + (known["axis"] @ (position - point)) * known["axis"])
+
+    def rod(start: Array, end: Array, color: Rgba) -> Shape:
+        (a, b, c), (x, y, z) = start.tolist(), end.tolist()
+        return rod_shape((a, b, c), (x, y, z), 0.012 * size, color)
+
+    dots = positions[spaced_indices(len(positions), _DOTS)].tolist()
+    fixed = [Shape(Sphere(0.008 * size), shift(*dot), color=_ORANGE) for dot in dots]
+    moved = [box_shape((0.06 * size,) * 3, (0.0, 0.0, 0.0), BLUE)]
+    if "axis" in known:
+        half, middle = 0.5 * size * known["axis"], nearest(positions.mean(axis=0))
+        fixed.append(rod(middle - half, middle + half, RED))
+    if "point" in known:
+        reference = known["reference"]
+        rotation = reference[:3, :3] if motion.rows == 6 else np.eye(3)
+        arm = rotation.T @ (nearest(reference[:3, 3]) - reference[:3, 3])
+        if np.linalg.norm(arm) > 0.01 * size:
+            moved.append(rod(np.zeros(3), arm, BLUE))
+    model = Model()
     with model.edit() as edit:
         if pair.parent != WORLD:
             edit.add_frame(pair.parent, WORLD, translation(0, 0, 0))
-        edit.apply(_make_operation(fit, pair.parent, pair.child), tag=pair.child)
-        edit.apply(SetBody(pair.parent, Body(_parent_shapes(fit, positions, size))))
-        edit.apply(SetBody(pair.child, Body(_child_shapes(fit, size))))
+        edit.apply(operation, tag=pair.child)
+        edit.apply(SetBody(pair.parent, Body(tuple(fixed))))
+        edit.apply(SetBody(pair.child, Body(tuple(moved))))
     return model
-
-
-def _make_operation(fit: Fit, parent: str, child: str) -> Operation:
-    """Return the joint as an operation; for positions alone see :func:`make_joint_model`."""
-    if fit.motion.rows == 6 or fit.family == CURVE:
-        return fit.operation(name=child, parent=parent, child=child, as_point=True)
-    right = fit.motion.right.copy()
-    right[:3, :3] = fit.motion.left[:3, :3].T
-    limits = [(float(low), float(high)) for low, high in fit.range]
-    return joint_operation(replace(fit.motion, right=right), limits, child, parent, child)
-
-
-def _parent_shapes(fit: Fit, positions: Array, size: float) -> tuple[Shape, ...]:
-    """Return the axis, and dots at observed positions, in the parent's frame."""
-    dots = positions[spaced_indices(len(positions), _DOTS)]
-    parts = [Shape(Sphere(0.008 * size), shift(*map(float, dot)), color=_ORANGE) for dot in dots]
-    if "axis" in fit.parameters:
-        half = 0.5 * size * np.asarray(fit.parameters["axis"])
-        middle = _closest_point_on_axis(fit, positions.mean(axis=0))
-        parts.append(_rod(middle - half, middle + half, size, RED))
-    return tuple(parts)
-
-
-def _child_shapes(fit: Fit, size: float) -> tuple[Shape, ...]:
-    """Return a box for the child, and a rod from it to its axis if there is one, in the child's frame."""
-    side = 0.06 * size
-    parts = [box_shape((side, side, side), (0.0, 0.0, 0.0), BLUE)]
-    if "point" in fit.parameters:
-        reference = np.asarray(fit.parameters["reference"])
-        rotation = reference[:3, :3] if fit.motion.rows == 6 else np.eye(3)
-        arm = rotation.T @ (_closest_point_on_axis(fit, reference[:3, 3]) - reference[:3, 3])
-        if np.linalg.norm(arm) > 0.01 * size:
-            parts.append(_rod(np.zeros(3), arm, size, BLUE))
-    return tuple(parts)
-
-
-def _rod(start: Array, end: Array, size: float, color: Rgba) -> Shape:
-    (a, b, c), (x, y, z) = start.tolist(), end.tolist()
-    return rod_shape((a, b, c), (x, y, z), 0.012 * size, color)
-
-
-def _closest_point_on_axis(fit: Fit, position: Array) -> Array:
-    """Return the point of the axis closest to a position; the position itself if there is no axis."""
-    if "point" not in fit.parameters:
-        return position
-    axis, point = np.asarray(fit.parameters["axis"]), np.asarray(fit.parameters["point"])
-    return np.asarray(point + (axis @ (position - point)) * axis)

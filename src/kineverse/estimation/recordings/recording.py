@@ -15,6 +15,8 @@ from kineverse.model.frame import WORLD
 
 Indices = npt.NDArray[np.intp]
 
+_ROUNDING = 1e-9  # difference that rounding makes
+
 
 @dataclass(frozen=True, eq=False)
 class RecordedTrack:
@@ -66,6 +68,13 @@ class RecordedPair:
             return np.asarray(np.linalg.solve(self.parent_poses, self.child_poses))
         offsets = self.child_poses - self.parent_poses[:, :3, 3]
         return np.asarray(np.einsum("nji,nj->ni", self.parent_poses[:, :3, :3], offsets))
+
+    @property
+    def is_in_plane(self) -> bool:
+        """True if z, or roll and pitch, are the same in all observations, so that they were not measured."""
+        relative = self.relative
+        fixed = relative[:, 2, :3] if relative.ndim == 3 else relative[:, 2]
+        return len(fixed) > 1 and bool(np.ptp(fixed, axis=0).max() < _ROUNDING)
 
     @property
     def repeats(self) -> npt.NDArray[np.bool_]:

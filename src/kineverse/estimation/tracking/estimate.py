@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from types import MappingProxyType
-from typing import TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -16,20 +15,31 @@ from kineverse.estimation.linear_algebra import inverse_spd
 from kineverse.lie import Array
 from kineverse.model.frame import WORLD
 from kineverse.model.model_view import ModelView
-from kineverse.state import State
+from kineverse.state import State, StateLike
 from kineverse.symbols import Symbol
 
 from .gaussian_sum import GaussianSum
 from .gaussian_sum_filter import StepResult, UpdateStep
+from .process_model import Speeds
 from .residuals import Measurements
 from .speed_update import Residual, SpeedValue
 from .state_space import Layout
 
 Groups = npt.NDArray[np.bool_]
-RecentReading: TypeAlias = tuple[float | None, Measurements, Array, Mapping[str, SpeedValue]]
-"""Time, measurements of the state, inputs, and measured speeds of an update."""
-
+_AGREEING = 2  # updates in a row that end a loss; a single one may agree by chance
 _QUANTILE = 4.753  # quantile of the standard normal distribution that is exceeded once in a million
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """Prediction to a time, or update by measurements at it."""
+
+    stamp: float | None  # [s]; None for the present time
+    reading: Measurements | None = None  # None for a prediction
+    speeds: Mapping[str, SpeedValue] = field(default_factory=dict)  # measured speeds
+    inputs: StateLike | None = None  # the last ones if None
+    commands: Speeds = field(default_factory=dict)
+    noise: Speeds = field(default_factory=dict)  # process noise of this step alone
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,19 +47,22 @@ class TrackLoss:
     """Rejected measurements and refuted updates in a row."""
 
     rejected: npt.NDArray[np.int64]  # number of times in a row that each observation was rejected (m,)
-    refuted: npt.NDArray[np.int64]  # number of updates in a row that refute the estimate (groups,)
+    refuted: npt.NDArray[
+        np.int64
+    ]  # updates in a row that refute an estimate, or minus those that agree (groups,)
     is_lost: Groups  # True for each lost group (groups,)
 
     def after(
         self, layout: Layout, reading: Measurements, outliers: Sequence[int], refuted: Groups, lost_after: int
     ) -> TrackLoss:
-        """Return the state after an update; a lost group stays lost until measurements agree with it."""
+        """Return the state after an update; a lost group stays lost until two in a row agree with it."""
         rejected, measured = self.rejected, find_measured(layout, reading)
         if outliers or rejected.any():
             rejected = np.where(reading.mask, 0, rejected)
             rejected[list(outliers)] = self.rejected[list(outliers)] + 1
-        count = np.where(measured, np.where(refuted, self.refuted + 1, 0), self.refuted)
-        is_lost = (self.is_lost | (count >= lost_after)) & (refuted | ~measured)
+        count = np.where(refuted, np.maximum(self.refuted, 0) + 1, np.minimum(self.refuted, 0) - 1)
+        count = np.where(measured, count, self.refuted)
+        is_lost = (self.is_lost & (count > -_AGREEING)) | (count >= lost_after)
         return TrackLoss(rejected, count, is_lost)
 
     def find_due(self, layout: Layout, outliers: Sequence[int], lost_after: int) -> Groups:
@@ -209,11 +222,7 @@ class Estimate:
     @cached_property
     def information(self) -> Array:
         """Inverse of the covariance."""
-        result = self._belief.information.copy()
-        for group, record in zip(self._layout.groups, self._belief.records, strict=True):
-            if record is not None:
-                result[group.block] = inverse_spd(self.covariance[group.block])
-        return result
+        return inverse_spd(self.covariance)
 
     @cached_property
     def covariance(self) -> Array:
@@ -282,24 +291,25 @@ class RecentPoses:
     times: Array | None  # (N,) [s]; None if they have none
 
 
-def collect_recent_poses(model: ModelView, layout: Layout, readings: Sequence[RecentReading]) -> RecentPoses:
-    """Return the poses of readings with their times, of the first observer among the observations."""
+def collect_recent_poses(model: ModelView, layout: Layout, updates: Sequence[Step]) -> RecentPoses:
+    """Return the poses of updates with their times, of the first observer among the observations."""
     poses = {i: one for i, one in enumerate(layout.observations) if one.is_pose}
     observer = next((one.relative_to for one in poses.values()), "")
-    has_times = all(stamp is not None for stamp, *_ in readings)
-    stamps = [stamp if has_times else k for k, (stamp, *_) in enumerate(readings)]
-    # Readings of one time are one row.
+    has_times = all(one.stamp is not None for one in updates)
+    stamps = [one.stamp if has_times else k for k, one in enumerate(updates)]
+    # Updates at one time are one row.
     times, rows = np.unique(np.array(stamps, dtype=float), return_inverse=True)
     measured, covariances = {}, {}
     inputs = np.zeros((len(times), len(layout.inputs)))
-    for row, (_, _, values, _) in zip(rows.tolist(), readings, strict=True):
-        inputs[row] = values
+    for row, update in zip(rows.tolist(), updates, strict=True):
+        known = State(update.inputs or {})
+        inputs[row] = [known[s] for s in layout.inputs]
     for i, one in poses.items():
         if one.relative_to == observer:
             measured[one.frame] = np.full((len(times), 4, 4), np.nan)
             weights = []
-            for row, (_, reading, *_) in zip(rows.tolist(), readings, strict=True):
-                if reading.mask[i]:
+            for row, update in zip(rows.tolist(), updates, strict=True):
+                if (reading := update.reading) is not None and reading.mask[i]:
                     measured[one.frame][row] = reading.values[layout.measurement_slices[i]].reshape(4, 4)
                     weights.append(reading.whitening[layout.whitening_slices[i]].reshape(6, 6))
             white: Array = np.array(weights).reshape(-1, 6, 6)

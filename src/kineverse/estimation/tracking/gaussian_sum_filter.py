@@ -67,10 +67,7 @@ class UpdateStep:
         self.native = NativeMapSolver(self.solver, self.function) if suits else None
         self.unobservable = UnobservableDirections(layout)
         self.static_batch, self.ridge_covariance = StaticBatch(self), RidgeCovariance(self)
-        # The cost of such a group is convex: a restart ends where the update did.
-        self._is_affine = [layout.is_affine(number) for number in self._all_groups]
         self.periods: Mapping[Symbol, float] = {}
-        self.counted: frozenset[Symbol] = frozenset()
         if self.native:
             native_library.prepare()
 
@@ -149,8 +146,6 @@ class UpdateStep:
             return [], 0  # a gross error is too far away for least squares
         if self.outliers is None:
             unexplained = find_unexplained(result)
-            if unexplained and not self.counted:
-                unexplained = self._find_unobserved(belief, result)
             settled = [n for n in single if n not in unexplained] if unexplained else single
         else:
             are_certain = self._are_inliers(belief, result, reading, self.outliers)
@@ -232,8 +227,9 @@ class UpdateStep:
             speeds = {v: speed for v, speed in speeds.items() if v not in estimated}
             noise = {v: q for v, q in noise.items() if v not in estimated}
         moving = self.process_model.find_moving_groups(speeds, noise)
-        recorded = [n for n in moving if belief.records[n] is not None]
-        noise_only = [n for n in recorded if self.process_model.is_noise_only(n, speeds)]
+        still = {*moving}.difference(self.process_model.find_moving_groups(speeds, {}))
+        recorded = [n for n in still if belief.records[n] is not None]
+        noise_only = [n for n in recorded if not self.process_model.is_carried(n)]
         belief = self._inflated(belief, set(moving).difference(noise_only))
         moved = None
         if self.native is not None and self.native.is_ready:
@@ -386,9 +382,8 @@ class UpdateStep:
 
     def _find_unobserved(self, before: InformationState, result: MapResult) -> list[int]:
         """Return the groups whose residuals exceed the noise and that have unobservable directions."""
-        curved = [n for n in find_unexplained(result) if not self._is_affine[n]]
-        records, is_in = before.records, self.unobservable.is_in
-        return [n for n in curved if records[n] is not None or is_in(n, result.belief)]
+        records, is_in, beyond = before.records, self.unobservable.is_in, find_unexplained(result)
+        return [n for n in beyond if records[n] is not None or is_in(n, result.belief)]
 
 
 def _require_finite(*arrays: Array) -> None:

@@ -5,11 +5,11 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-import numpy.typing as npt
 
 from kineverse.errors import InvalidValueError, KineverseError, UnknownNameError, suggest
 from kineverse.lie import Array
@@ -36,13 +36,10 @@ _MOST_TURNS = 12  # turns after which gears may stand as before: a gear of ratio
 _SAMPLES = (0.125, 0.375, 0.625, 0.875)  # relative positions between limits at which predictions are sampled
 
 
-def find_turning_coordinates(
-    update_step: UpdateStep, x: Array, inputs: Array
-) -> tuple[dict[Symbol, float], frozenset[Symbol]]:
-    """Return coordinates with periods of all predictions [rad], and those whose turn some observe."""
+def find_periods(update_step: UpdateStep, x: Array, inputs: Array) -> dict[Symbol, float]:
+    """Return coordinates with a period of all predictions [rad], in whole turns."""
     layout, limits = update_step.layout, update_step.limits
     periods: dict[Symbol, float] = {}
-    counted = []
     for i in np.flatnonzero(np.isinf(limits.lower) & np.isinf(limits.upper)).tolist():
 
         def turned(turns: int, i: int = i) -> Array:
@@ -50,47 +47,24 @@ def find_turning_coordinates(
             there[i] += turns * math.tau
             return update_step.residuals.evaluate(there, inputs)
 
-        def is_same_after(turns: int, before: Array) -> npt.NDArray[np.bool_]:
-            with np.errstate(invalid="ignore"):  # where the model is not finite
-                change = np.abs(_difference(layout, before, turned(turns)))
-            return np.asarray(change < _SAME * (1 + np.abs(x).max()))
-
-        coordinate = layout.tangent_space.coordinates[i]
-        try:
+        with suppress(
+            KineverseError, StopIteration
+        ):  # the loop does not close there, or it is no number of turns
             before = turned(0)
-            is_same = is_same_after(1, before)
-            if is_same.all():
-                periods[coordinate] = math.tau
-                continue
-            if coordinate not in layout.tangent_space.by_speeds and _turns_some(layout, i, before, is_same):
-                counted.append(coordinate)
             # Most coordinates are no angles: one look is enough for all numbers of turns.
-            if is_same_after(math.lcm(*range(1, _MOST_TURNS + 1)), before).all():
-                turns = next(k for k in range(2, _MOST_TURNS + 1) if is_same_after(k, before).all())
-                periods[coordinate] = turns * math.tau
-        except (KineverseError, StopIteration):  # the loop does not close there, or it is no number of turns
-            continue
-    return periods, frozenset(counted)
+            for numbers in ((math.lcm(*range(1, _MOST_TURNS + 1)),), range(1, _MOST_TURNS + 1)):
+                turns = next(k for k in numbers if _is_same(layout, before, turned(k), x))
+            periods[layout.tangent_space.coordinates[i]] = turns * math.tau
+    return periods
 
 
-def _difference(layout: Layout, before: Array, after: Array) -> Array:
-    """Return the change of predicted values and Jacobians, with periodic values wrapped."""
-    result = after - before
+def _is_same(layout: Layout, before: Array, after: Array, x: Array) -> bool:
+    """Return True if predicted values, of which some are periodic, and Jacobians are equal."""
+    with np.errstate(invalid="ignore"):  # where the model is not finite
+        change = after - before
     for one, where in zip(layout.observations, layout.value_slices, strict=True):
-        result[where] = wrap_difference(result[where], one.period)
-    return result
-
-
-def _turns_some(layout: Layout, i: int, predicted: Array, is_same: npt.NDArray[np.bool_]) -> bool:
-    """Return True if an observation that moves with a coordinate is the same after a full turn."""
-    group = next(group for group in layout.groups if i in group.x)
-    column = group.tangent_index(group.x.tolist().index(i))
-    for k in group.observation_indices:
-        value, jacobian = layout.value_slices[k], layout.jacobian_slices[k]
-        if is_same[value].all() and is_same[jacobian].all():
-            if predicted[jacobian].reshape(layout.observations[k].size, -1)[:, column].any():
-                return True
-    return False
+        change[where] = wrap_difference(change[where], one.period)
+    return bool((np.abs(change) < _SAME * (1 + np.abs(x).max())).all())
 
 
 def spread_starts(update_step: UpdateStep, first: InformationState, inputs: Array) -> GaussianSum:
@@ -304,7 +278,7 @@ def make_initial_belief(
     """Return the initial belief, and set the periodic coordinates and initial deviations of a tracker."""
     tangent_space, limits = update_step.layout.tangent_space, update_step.limits
     x = initial_point(model, tangent_space, limits, values.coordinates)
-    update_step.periods, update_step.counted = find_turning_coordinates(update_step, x, inputs)
+    update_step.periods = find_periods(update_step, x, inputs)
     usual = initial_deviations(tangent_space, limits, update_step.periodic)
     belief = InitialBelief(x, usual, usual).with_values(update_step, values)
     update_step.unobservable.deviations = belief.deviations

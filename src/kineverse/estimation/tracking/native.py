@@ -61,7 +61,8 @@ class NativeMapSolver:
         size, directions = len(space.coordinates), len(space.tangent)
         self._motions = [solver.process_model.flow(number) for number in range(count)]
         is_varying = [np.empty(0) if m is None else m.is_varying.reshape(-1) for m in self._motions]
-        self._size, self._is_linear = size, not (solver.process_model.has_rates or layout.limits)
+        is_carried = map(solver.process_model.is_carried, range(count))
+        self._size, self._is_linear = size, not (any(is_carried) or layout.limits)
         indices: dict[str, Any] = {
             "is_pose": [one.is_pose for one in observed],
             "size": [one.size for one in observed],

@@ -130,13 +130,11 @@ def turned_states(
     inputs: Array,
     groups: Sequence[int],
 ) -> list[tuple[InformationState, list[int]]]:
-    """Return prior beliefs on other turns of counted coordinates, as of a pinion, with their group."""
-    result = []
-    for x in step.counted:
-        i = step.layout.tangent_space.coordinates.index(x)
-        number = next(n for n, group in enumerate(step.layout.groups) if i in group.x)
-        group = step.layout.groups[number]
-        if number not in groups or group.by_speeds:
+    """Return prior beliefs on other turns of unlimited coordinates, as of a pinion, with their group."""
+    result, layout, limits = [], step.layout, step.limits
+    for number, i in [(n, i) for n in groups for i in layout.groups[n].x.tolist()]:
+        group, is_free = layout.groups[number], np.isinf(limits.lower[i]) and np.isinf(limits.upper[i])
+        if group.by_speeds or not is_free or layout.tangent_space.coordinates[i] in step.periods:
             continue
         place, errors = after.x.copy(), []
         for turn in (0.0, math.tau):

@@ -126,11 +126,6 @@ class ProcessModel:
         flow = self._flows.get(number)
         return self._layout.groups[number].tangent if flow is None else flow.speeds
 
-    def is_noise_only(self, number: int, speeds: Speeds) -> bool:
-        """Return True if a group moves by noise alone, in directions that are its coordinates."""
-        group = self._layout.groups[number]
-        return number not in self._flows and not any(speeds.get(v, 0.0) for v in group.tangent)
-
     def is_carried(self, number: int) -> bool:
         """Return True if rates other than their own speeds move coordinates of a group."""
         return number in self._flows
@@ -143,11 +138,6 @@ class ProcessModel:
     def flow(self, number: int) -> RateFlow | None:
         """Return the flow of a group along its tangent; None if the tangent is its coordinates."""
         return self._steps.get(number)
-
-    @property
-    def has_rates(self) -> bool:
-        """True if some coordinates move by rates other than their own speeds."""
-        return bool(self._flows)
 
     def find_moving_groups(self, speeds: Speeds, noise: Speeds) -> list[int]:
         """Return the numbers of the groups that move at these speeds or with noise."""

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
-from types import MappingProxyType
 
 import numpy as np
 
@@ -15,71 +13,50 @@ from kineverse.lie import Array
 from kineverse.state import State, StateLike
 
 from .bounds import SpeedLocks
-from .estimate import TrackerState, TrackLoss, find_refuted
+from .estimate import Step, TrackerState, TrackLoss, find_refuted
 from .gaussian_sum_filter import StepResult, UpdateStep
 from .information_state import InformationState
 from .initialization import InitialBelief
 from .process_model import Speeds
-from .residuals import Measurements
-from .speed_update import SpeedUpdate, SpeedValue
+from .speed_update import SpeedUpdate
 
 
-@dataclass(frozen=True, eq=False)
-class Step:
-    """Step of a tracker."""
-
-    stamp: float  # time at its end [s]
-    before: TrackerState
-    apply: Callable[[TrackerState], TrackerState]
-    predict: Callable[[TrackerState, float], TrackerState]
-
-
-@dataclass(eq=False)
 class FixedLag:
-    """Steps of the last ``lag`` seconds, which are repeated after a late measurement."""
+    """Events of the last ``lag`` seconds, which are repeated after a late measurement."""
 
-    lag: float
-    steps: tuple[Step, ...] = ()
+    def __init__(self, recursion: Recursion, lag: float) -> None:
+        self._recursion, self.lag = recursion, lag
+        self.events: tuple[tuple[float, TrackerState, Step], ...] = ()  # with time and state before
 
-    def append(self, step: Step) -> None:
-        """Add a step, and drop those too old for any late measurement."""
-        oldest = step.stamp - self.lag
-        self.steps = (*(one for one in self.steps if one.stamp >= oldest), step)
+    def append(self, time: float | None, before: TrackerState, event: Step) -> None:
+        """Add an event, and drop those too old for any late measurement."""
+        if self.lag and time is not None:
+            kept = (one for one in self.events if one[0] >= time - self.lag)
+            self.events = (*kept, (time, before, event))
 
-    def insert(self, stamp: float, apply: Callable[[TrackerState], TrackerState]) -> TrackerState:
-        """Apply a late measurement at its time, repeat all later steps, and return the state at their end."""
-        later = [one for one in self.steps if one.stamp > stamp]
-        if later and later[-1].stamp - stamp > self.lag:
+    def insert(self, stamp: float, late: Step) -> TrackerState:
+        """Apply a late measurement at its time, and return the state after all later events."""
+        events = [one for one in self.events if one[0] <= stamp]
+        later = self.events[len(events) :]
+        if later and later[-1][0] - stamp > self.lag:
             raise InvalidValueError(
                 f"A measurement at {stamp:g} s is later than the lag of {self.lag:g} s: leave it out, or "
                 "give the tracker a longer lag=."
             )
         # A state without a time begins at the first measurement.
-        began = later[0].before.stamp if later else math.inf
-        if began is not None and began > stamp:
+        if not later or (later[0][1].stamp is not None and later[0][1].stamp > stamp):
             raise InvalidValueError(
                 f"A measurement at {stamp:g} s is from before the start or a reset: leave it out."
             )
-        predict, state = later[0].predict, later[0].before
-        steps = [one for one in self.steps if one.stamp <= stamp]
-        for one in (Step(stamp, state, partial(_apply_late, predict, stamp, apply), predict), *later):
-            steps.append(replace(one, before=state))
-            state = one.apply(state)
-        self.steps = tuple(steps)
+        _, state, motion = later[0]
+        late = replace(late, commands=motion.commands, noise=motion.noise)
+        if motion.reading is None and late.inputs is None:
+            late = replace(late, inputs=motion.inputs)
+        for time, event in ((stamp, late), *((time, event) for time, _, event in later)):
+            events.append((time, state, event))
+            state = self._recursion.apply(state, event)
+        self.events = tuple(events)
         return state
-
-
-def _apply_late(
-    predict: Callable[[TrackerState, float], TrackerState],
-    stamp: float,
-    apply: Callable[[TrackerState], TrackerState],
-    before: TrackerState,
-) -> TrackerState:
-    return apply(predict(before, stamp))
-
-
-NO_NOISE: Speeds = MappingProxyType({})  # process noise of no speed
-NO_SPEEDS: Mapping[str, SpeedValue] = {}  # no measured speeds; a proxy could not be pickled
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,64 +80,46 @@ class Recursion:
         loss = TrackLoss(none, np.zeros(count, dtype=np.int64), np.zeros(count, dtype=bool))
         return TrackerState(mixture, result, loss, inputs, stamp)
 
-    def predict(
-        self, state: TrackerState, dt: float, speeds: Speeds, noise_now: Speeds = NO_NOISE
-    ) -> TrackerState:
-        """Return the state after a time step [s]; ``noise_now`` overrides the process noise."""
+    def predict(self, state: TrackerState, dt: float, event: Step) -> TrackerState:
+        """Return the state after a time step [s]."""
         if dt == 0.0:
             return state
         state = replace(state, stamp=None if state.stamp is None else state.stamp + dt, reading=None)
-        usual = {**self.noise, **noise_now}
-        if not (speeds or usual):
+        usual = {**self.noise, **event.noise}
+        if not (event.commands or usual):
             return state
 
         def moved(belief: InformationState) -> InformationState:
-            moving, noise = speeds, usual
+            moving, noise = event.commands, usual
             if self.locks:
                 free = self.locks.free(belief, state.inputs)
                 held = {v: 0.0 for v in usual if v not in free}
                 noise = {v: q for v, q in noise.items() if v in free}
-                moving = {v: speed for v, speed in speeds.items() if v in free} | held
+                moving = {v: speed for v, speed in moving.items() if v in free} | held
             return self.update_step.predict(belief, state.inputs, dt, moving, noise)
 
         return replace(state, mixture=state.mixture.map(moved))
 
-    def advance(
-        self,
-        state: TrackerState,
-        stamp: float,
-        speeds: Speeds,
-        inputs: StateLike | None = None,
-        noise_now: Speeds = NO_NOISE,
-    ) -> TrackerState:
-        """Return the state predicted to a time; a state without a time begins there."""
-        if inputs is not None:
-            state = replace(state, inputs=self.read_inputs(state.inputs, inputs))
-        if state.stamp is None:
-            return replace(state, stamp=stamp)
-        return replace(self.predict(state, stamp - state.stamp, speeds, noise_now), stamp=stamp)
+    def _advance(self, state: TrackerState, event: Step) -> TrackerState:
+        """Return the state predicted to the time of an event; a state without a time begins there."""
+        if event.stamp is None or state.stamp is None:
+            return replace(state, stamp=event.stamp)
+        return replace(self.predict(state, event.stamp - state.stamp, event), stamp=event.stamp)
 
-    def update(
-        self,
-        state: TrackerState,
-        reading: Measurements,
-        stamp: float | None,
-        speeds: Speeds,
-        inputs: StateLike | None,
-        noise_now: Speeds = NO_NOISE,
-        measured_speeds: Mapping[str, SpeedValue] = NO_SPEEDS,
-    ) -> TrackerState:
-        """Return the state after a reading at a time, or at the present one."""
-        step, values = self.update_step, self.read_inputs(state.inputs, inputs)
+    def apply(self, state: TrackerState, event: Step) -> TrackerState:
+        """Return the state after an event."""
+        step, values = self.update_step, self.read_inputs(state.inputs, event.inputs)
+        if event.reading is None:
+            return self._advance(replace(state, inputs=values), event)
         # The prediction uses the previous values of the inputs, if there are any.
         if not np.isfinite(state.inputs).all():
             state = replace(state, inputs=values)
-        latest = state.reading
-        if stamp is not None:
-            state, latest = self.advance(state, stamp, speeds, noise_now=noise_now), reading
+        reading, latest = event.reading, state.reading
+        if event.stamp is not None:
+            state, latest = self._advance(state, event), reading
             if state.reading is not None:
-                latest = step.reader.combine(state.reading, reading, stamp)
-        mixture, nis, dof, wrong = self.speed_update.update(state.mixture, reading, measured_speeds, values)
+                latest = step.reader.combine(state.reading, reading, event.stamp)
+        mixture, nis, dof, wrong = self.speed_update.update(state.mixture, reading, event.speeds, values)
         result = step.update(mixture, reading, values)
         result.nis, result.dof = result.nis + nis, result.dof + dof
         has_outliers = step.outliers is not None
@@ -188,9 +147,7 @@ class Recursion:
                 loss = replace(loss, refuted=np.where(is_found, 0, loss.refuted))
         outliers = (*(step.layout.observations[i].name for i in result.outliers), *wrong)
         predicted = state.mixture.best
-        residuals = partial(
-            self.speed_update.residuals, predicted, reading, measured_speeds, values, outliers
-        )
+        residuals = partial(self.speed_update.residuals, predicted, reading, event.speeds, values, outliers)
         return TrackerState(mixture, result, loss, values, state.stamp, latest, outliers, residuals)
 
     def read_inputs(self, last: Array, inputs: StateLike | None) -> Array:

@@ -10,8 +10,7 @@ import numpy.typing as npt
 
 from kineverse.compilation import CompiledFunction
 from kineverse.errors import InvalidValueError, ShapeError, UnknownNameError, suggest
-from kineverse.estimation.pose_checks import check_rigid
-from kineverse.expressions.expression import Expression
+from kineverse.estimation.pose_checks import as_numbers, check_covariances, check_rigid
 from kineverse.lie import Array, inverse_right_jacobian, pose_difference, transform
 
 from .measurements import MeasurementModel, require_covariance, wrap_difference
@@ -83,7 +82,7 @@ class MeasurementReader:
             raise InvalidValueError(
                 f"update_poses is for poses alone, which {', '.join(self._vectors)} is not. Use update."
             )
-        checked = _numbers(poses, "The poses")
+        checked = as_numbers(poses, "The poses")
         count = len(self._all)
         if checked.shape != (count, 4, 4):
             raise ShapeError(f"The poses are an array of shape {(count, 4, 4)}, not {checked.shape}.")
@@ -96,20 +95,16 @@ class MeasurementReader:
         return Measurements(values, observed, *self._whiten_all(covariances, observed))
 
     def _whiten_all(self, covariances: npt.ArrayLike, observed: npt.NDArray[np.bool_]) -> tuple[Array, Array]:
-        checked, shape = _numbers(covariances, "The covariances"), (len(observed), 6, 6)
-        if checked.shape != shape:
-            raise ShapeError(f"The covariances are an array of shape {shape}, not {checked.shape}.")
-        R = np.where(observed[:, None, None], checked, np.eye(6))
+        given = as_numbers(covariances, "The covariances")
+        if given.shape != (shape := (len(observed), 6, 6)):
+            raise ShapeError(f"The covariances are an array of shape {shape}, not {given.shape}.")
+        given = np.where(observed[:, None, None], given, np.eye(6))
         try:
-            if not np.isfinite(R).all() or np.abs(R - np.swapaxes(R, 1, 2)).max() > 1e-9 * np.abs(R).max():
-                raise np.linalg.LinAlgError
-            roots = np.linalg.cholesky(R)
-        except np.linalg.LinAlgError:
+            roots = np.linalg.cholesky(check_covariances(given, len(given), 6, "observations"))
+        except InvalidValueError:
             for i in np.flatnonzero(observed).tolist():
-                require_covariance(checked[i], 6, self._layout.observations[i].label)
-            raise InvalidValueError(
-                "The covariances are too small or too large for floating point."
-            ) from None
+                require_covariance(given[i], 6, self._layout.observations[i].label)
+            raise
         scales = np.log(np.diagonal(roots, axis1=1, axis2=2)).sum(axis=1) + 3.0 * np.log(2.0 * np.pi)
         return np.tril(np.linalg.inv(roots)).reshape(-1), scales
 
@@ -172,11 +167,11 @@ def log_scale(covariance: Array) -> float:
 
 def _checked_value(value: Any, one: MeasurementModel) -> Array:
     if one.is_pose:
-        pose = _numbers(value, f"The pose of '{one.label}'")
+        pose = as_numbers(value, f"The pose of '{one.label}'")
         if pose.shape != (4, 4):
             raise ShapeError(f"The pose of '{one.label}' is a 4×4 transform, not of shape {pose.shape}.")
         return pose.reshape(-1)
-    vector = _numbers(value, f"The value of '{one.label}'")
+    vector = as_numbers(value, f"The value of '{one.label}'")
     if vector.shape == () and one.size == 1:
         vector = vector.reshape(1)
     if vector.shape != (one.size,):
@@ -184,17 +179,6 @@ def _checked_value(value: Any, one: MeasurementModel) -> Array:
     if not np.isfinite(vector).all():
         raise InvalidValueError(f"The value of '{one.label}' is not finite.")
     return vector
-
-
-def _numbers(values: npt.ArrayLike, label: str) -> Array:
-    try:
-        if np.iscomplexobj(values):
-            raise TypeError
-        return np.asarray(values, dtype=np.float64)
-    except (TypeError, ValueError):
-        is_expression = isinstance(values, Expression)
-        hint = " expression({symbol: value}) has those of an expression." if is_expression else ""
-        raise InvalidValueError(f"{label}: these are no numbers: {values!r:.80}.{hint}") from None
 
 
 class Residuals:

@@ -8,7 +8,6 @@ q̇ = R(q) u exclude, the speeds u span the tangent.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -219,24 +218,6 @@ class Layout:
 
     def _group_of_limit(self, number: int) -> CoordinateGroup:
         return next(group for group in self.groups if number in group.limits)
-
-    def is_affine(self, number: int) -> bool:
-        """Return True if all measurements of a group are affine functions of its coordinates."""
-        group = self.groups[number]
-        if group.by_speeds or group.limits:
-            return False
-        coordinates = set(group.coordinates)
-        for i in group.observation_indices:
-            one = self.observations[i]
-            value = self.tangent_space.resolve(one.value)
-            if one.is_pose:
-                if not coordinates.isdisjoint(value[:3, :3].symbols):
-                    return False
-            elif math.isfinite(one.period):
-                return False
-            if not coordinates.isdisjoint(self._jacobian(one, value, group).symbols):
-                return False
-        return True
 
     def compile_function(self) -> CompiledFunction:
         """Compile the values and derivatives of all observations and limits as one function."""

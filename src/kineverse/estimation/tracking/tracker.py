@@ -5,9 +5,9 @@ from __future__ import annotations
 import copy
 import math
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
-from functools import partial
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -22,7 +22,7 @@ from kineverse.state import State, StateLike
 from kineverse.symbols import Symbol
 
 from .bounds import SpeedLocks, arrange_state
-from .estimate import Estimate, RecentPoses, RecentReading, TrackerState, TrackLoss, collect_recent_poses
+from .estimate import Estimate, RecentPoses, Step, TrackLoss, collect_recent_poses
 from .gaussian_sum_filter import UpdateStep
 from .information_state import InformationState
 from .initialization import InitialValues, make_initial_belief
@@ -35,7 +35,7 @@ from .process_model import (
     choose_processes,
     default_process_noise,
 )
-from .recursion import NO_SPEEDS, FixedLag, Recursion, Step
+from .recursion import FixedLag, Recursion
 from .residuals import Measurements
 from .speed_process import SpeedProcess
 from .speed_update import SpeedUpdate, SpeedValue, build_speed_models
@@ -111,20 +111,9 @@ class Tracker:
         lag: float = 0.0,
         keep: int = 600,
     ) -> None:
+        given = locals().items()
+        self._options = {name: value for name, value in given if name not in ("self", "model", "observed")}
         self._observed = list_observed(observed)
-        self._options: dict[str, Any] = {
-            "start": start,
-            "uncertainty": uncertainty,
-            "process": process,
-            "process_noise": process_noise,
-            "outliers": outliers,
-            "locks": locks,
-            "inputs": inputs,
-            "lost_after": lost_after,
-            "restart": restart,
-            "lag": lag,
-            "keep": keep,
-        }
         lost_after, keep = as_count("lost_after", lost_after, 1), as_count("keep", keep, 1)
         lag = as_tolerance(lag, "lag= [s]")
         keys = (inputs,) if isinstance(inputs, str | Symbol) else inputs
@@ -159,9 +148,9 @@ class Tracker:
             self._update_step, self._speed_update, first, noise, held, lost_after, restart
         )
         self._now = self._recursion.start(values, getattr(start, "stamp", None))
-        self._buffer = FixedLag(lag)
+        self._buffer = FixedLag(self._recursion, lag)
         self._lock = CallLock()
-        self._recent: deque[RecentReading] = deque(maxlen=keep)
+        self._recent: deque[Step] = deque(maxlen=keep)
 
     @property
     def symbols(self) -> tuple[Symbol, ...]:
@@ -246,19 +235,17 @@ class Tracker:
                 return result
 
             other._now = replace(start, mixture=start.mixture.map(turned))
-            other._buffer.steps = ()
+            other._buffer.events = ()
             other._recent.clear()
             other._repeat(self)
         return other
 
     def _repeat(self, other: Tracker) -> None:
-        inputs = {str(s): k for k, s in enumerate(other._layout.inputs)}
         recent = list(other._recent)
-        if all(stamp is not None for stamp, *_ in recent):
-            recent.sort(key=lambda one: one[0] or 0.0)
-        for stamp, reading, values, speeds in recent:
-            known = {s: values[inputs[str(s)]] for s in self._layout.inputs if str(s) in inputs}
-            self._update(reading, stamp, None, State(known), None, speeds)
+        if all(one.stamp is not None for one in recent):
+            recent.sort(key=lambda one: one.stamp or 0.0)
+        for one in recent:
+            self._update(one)
 
     def _turns_from(self, other: Tracker) -> Array:
         """Return the whole turns of periodic coordinates to those of another tracker (n,) [rad]."""
@@ -325,7 +312,7 @@ class Tracker:
             now.loss.is_lost & ~chosen,
         )
         self._now = replace(now, mixture=mixture, loss=loss, stamp=stamp, reading=None)
-        self._buffer.steps = ()
+        self._buffer.events = ()
         if stamp is not None and now.stamp is not None and stamp < now.stamp:
             self._recent.clear()
         return self.estimate
@@ -360,14 +347,10 @@ class Tracker:
             For a speed with which no estimated coordinate moves.
         """
         dt = as_tolerance(dt, "The length of a step [s]")
-        speeds, noise = self._read_commands(commands), self._read_noise(process_noise)
-        before = self._now
-        known = self._recursion.read_inputs(before.inputs, inputs)
-        self._now = self._recursion.predict(replace(before, inputs=known), dt, speeds, noise)
-        if self._now.stamp is not None:
-            fixed = copy.copy(inputs)
-            advance = partial(self._recursion.advance, speeds=speeds, inputs=fixed, noise_now=noise)
-            self._remember(before, self._now.stamp, partial(advance, stamp=self._now.stamp), advance)
+        before, known = self._now, self._recursion.read_inputs(self._now.inputs, inputs)
+        event = self._make_step(None, None, commands, inputs, process_noise)
+        self._now = self._recursion.predict(replace(before, inputs=known), dt, event)
+        self._buffer.append(self._now.stamp, before, replace(event, stamp=self._now.stamp))
         return self.estimate
 
     def _read_commands(self, commands: StateLike | None) -> dict[Symbol, float]:
@@ -419,7 +402,7 @@ class Tracker:
         require_mapping(measurements, "A set of measurements")
         of_state, of_speeds = self._speed_update.read(measurements)
         reading = self._update_step.reader.read(of_state)
-        return self._update(reading, at, commands, inputs, process_noise, of_speeds)
+        return self._update(self._make_step(at, reading, commands, inputs, process_noise, of_speeds))
 
     @one_at_a_time
     def update_poses(
@@ -448,7 +431,7 @@ class Tracker:
             As in :meth:`update`.
         """
         reading = self._update_step.reader.read_poses(poses, mask, covariances)
-        return self._update(reading, at, commands, inputs, process_noise)
+        return self._update(self._make_step(at, reading, commands, inputs, process_noise))
 
     def wait(self, timeout: float | None = None) -> bool:
         """Wait for compiled code; return whether updates use it.
@@ -465,52 +448,43 @@ class Tracker:
         native_library.prepare(wait=True)
         return self._update_step.is_native
 
-    def _update(
+    def _make_step(
         self,
-        reading: Measurements,
         at: float | None,
+        reading: Measurements | None,
         commands: StateLike | None,
         inputs: StateLike | None,
-        process_noise: StateLike | None = None,
-        measured_speeds: Mapping[str, SpeedValue] = NO_SPEEDS,
-    ) -> Estimate:
-        # The caller may use the arrays again, while late measurements repeat the update.
-        reading = reading._replace(values=reading.values.copy(), mask=reading.mask.copy())
-        native = self._update_step.native
-        if native is None or not native.are_rigid(reading):
-            self._update_step.reader.check_poses(reading)
-        if at is None and (commands or process_noise):
-            subject = "Commands" if commands else "process_noise="
-            raise InvalidValueError(f"{subject} need the time they lasted: give at=, or call predict.")
-        noise = self._read_noise(process_noise)
+        process_noise: StateLike | None,
+        speeds: Mapping[str, SpeedValue] = MappingProxyType({}),
+    ) -> Step:
+        """Return an event after checks. The caller may use its arrays again."""
+        if reading is not None:
+            reading = reading._replace(values=reading.values.copy(), mask=reading.mask.copy())
+            native = self._update_step.native
+            if native is None or not native.are_rigid(reading):
+                self._update_step.reader.check_poses(reading)
+            if at is None and (commands or process_noise):
+                subject = "Commands" if commands else "process_noise="
+                raise InvalidValueError(f"{subject} need the time they lasted: give at=, or call predict.")
+        noise, speeds_now = self._read_noise(process_noise), self._read_commands(commands)
         stamp = None if at is None else require_time(at)
-        speeds, before = self._read_commands(commands), self._now
-        update, fixed = partial(self._recursion.update, reading=reading, stamp=stamp), copy.copy(inputs)
-        apply = partial(update, speeds=speeds, inputs=fixed, noise_now=noise, measured_speeds=measured_speeds)
+        return Step(stamp, reading, dict(speeds), copy.copy(inputs), speeds_now, noise)
+
+    def _update(self, event: Step) -> Estimate:
+        before, stamp = self._now, event.stamp
         if stamp is not None and before.stamp is not None and stamp < before.stamp:
             if not self._buffer.lag:
                 raise InvalidValueError(
                     f"Time goes backwards: an observation at {stamp:g} s after one at {before.stamp:g} s. A "
                     "tracker with lag= takes measurements that come late."
                 )
-            self._now = self._buffer.insert(stamp, apply)
+            self._now = self._buffer.insert(stamp, event)
         else:
-            self._now = apply(before)
-            if self._now.stamp is not None:
-                advance = partial(self._recursion.advance, speeds=speeds, noise_now=noise)
-                self._remember(before, self._now.stamp, apply, advance)
-        self._recent.append((stamp, reading, self._now.inputs, measured_speeds))
+            self._now = self._recursion.apply(before, event)
+            self._buffer.append(self._now.stamp, before, event)
+        inputs = State(dict(zip(self._layout.inputs, self._now.inputs.tolist(), strict=True)))
+        self._recent.append(Step(stamp, event.reading, event.speeds, inputs))
         return self.estimate
-
-    def _remember(
-        self,
-        before: TrackerState,
-        stamp: float,
-        apply: Callable[[TrackerState], TrackerState],
-        predict: Callable[[TrackerState, float], TrackerState],
-    ) -> None:
-        if self._buffer.lag:
-            self._buffer.append(Step(stamp, before, apply, predict))
 
     def __repr__(self) -> str:
         sizes = f"{len(self.symbols)} coordinates in {len(self.groups)} groups"

@@ -332,14 +332,7 @@ class KinematicGraph:
             yield from loop.closure.operations(name)
 
     def model(self, prefix: str | None = None, close: bool = True) -> Model:
-        """Build a model with a frame for each part.
-
-        Parameters
-        ----------
-        prefix
-            Prefix of all names except ``world``, separated by a slash.
-        close
-            True to close loops; False for the tree alone.
+        """Build a model with a frame for each part; see :meth:`operations` for the parameters.
 
         Raises
         ------
