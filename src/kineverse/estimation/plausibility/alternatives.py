@@ -19,6 +19,7 @@ import numpy as np
 from kineverse._checks import as_tolerance
 from kineverse.errors import InvalidValueError, KineverseError
 from kineverse.estimation.correlation import CorrelationSettings
+from kineverse.estimation.identification.joint_values import GRID
 from kineverse.estimation.identification.kinematic_graph.pairwise import (
     LOG_ANYWHERE,
     FamilyChoice,
@@ -72,7 +73,6 @@ def reject_outliers(residuals: KnownResiduals, outliers: Outliers | None) -> Row
     return inliers if is_usual else all_rows
 
 
-_WIDTHS = np.geomspace(1e-5, 10.0, 43)
 _STATIC_WIDTH = np.array([1e-9])
 _erf = np.vectorize(math.erf, otypes=[np.float64])
 
@@ -87,7 +87,7 @@ def log_evidence(served: KnownJoint, residuals: KnownResiduals, is_static: bool 
     best = np.zeros(len(served.lower))
     for j, (lower, upper) in enumerate(zip(served.lower, served.upper, strict=True)):
         values, variances = residuals.values[:, j], residuals.covariances[:, j, j]
-        widths = _STATIC_WIDTH if is_static else _WIDTHS
+        widths = _STATIC_WIDTH if is_static else GRID
         logs = _log_evidence_by_width(values, variances, lower, upper, widths, _log_density(served)[j])
         best[j] = widths[int(np.argmax(logs))]
         log += _log_mean(logs)

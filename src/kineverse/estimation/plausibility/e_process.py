@@ -70,7 +70,7 @@ class SequentialTest:
         self._threshold = -math.log(false_alarms)
         self._bet = _CensoredBet(outlier_fraction)
         # Number of independent looks so far, which orders the change points, and of those not tested yet.
-        self._time, self._owed = 0.0, _LEAST_WEIGHT
+        self._time, self._owed = 0.0, 0.0
         self._numbers: list[int] = []
         self.implausible_since: int | None = None
         self._displacement = _DisplacementTest(self._bet, displacement)
@@ -83,7 +83,7 @@ class SequentialTest:
             return
         observed = residuals.orthogonal[row], residuals.displacement_jacobian[row]
         self._owed += 1.0 / looks
-        if self._owed >= _LEAST_WEIGHT:
+        if self._owed >= _LEAST_WEIGHT or not self._numbers:
             self.add(*observed, residuals.one_sided[row], 1.0 / min(self._owed, 1.0), number)
             self._owed = 0.0
         self._bet.count(self._displacement.served_square(*observed) > _GROSS)
