@@ -14,7 +14,7 @@ typedef struct {
 
 static Answer lay(const Problem *p, double *memory) {
   int64_t rows = p->rows;
-  Answer a = {memory, memory + 1, memory + 2};
+  Answer a = {.cost = memory, .converged = memory + 1, .x = memory + 2};
   a.values = a.x + p->states;
   a.parents = a.values + p->count * p->joints;
   a.residuals = a.parents + p->count * 16;
