@@ -1,4 +1,4 @@
-"""Pose tables: files of several programs, data frames and arrays; names, units and parts of their columns.
+"""Pose tables: files of several programs, data frames and arrays; names, units and parts of their columns."""
 
 from __future__ import annotations
 
