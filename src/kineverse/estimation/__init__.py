@@ -18,7 +18,7 @@ if TYPE_CHECKING:
         Identifier as Identifier,
         identify as identify,
     )
-    from .identification.kinematic_graph.graph import (
+    from .identification.kinematic_graph import (
         KinematicEdge as KinematicEdge,
         KinematicGraph as KinematicGraph,
         RigidBody as RigidBody,

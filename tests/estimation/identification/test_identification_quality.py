@@ -11,7 +11,7 @@ from synthetic_recordings import angle_between, noisy, off_axis, recording
 
 from kineverse.estimation import Fit, identify, pose_covariance
 from kineverse.estimation.identification.families import JOINT_FAMILIES, GroupMotion
-from kineverse.estimation.identification.joint_values import PerObservation, fit_joint_ranges
+from kineverse.estimation.identification.marginal_likelihood import PerObservation, fit_joint_ranges
 from kineverse.estimation.identification.model_selection import solve_families
 from kineverse.estimation.identification.observations import check_observations
 

@@ -13,7 +13,7 @@ from synthetic_recordings import noisy
 
 import kineverse as kv
 from kineverse.estimation import identify_graph, pose_covariance
-from kineverse.estimation.identification.kinematic_graph.graph import (
+from kineverse.estimation.identification.kinematic_graph import (
     edge_probabilities,
     orient_tree,
     replacement_probabilities,

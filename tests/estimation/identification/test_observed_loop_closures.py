@@ -15,8 +15,8 @@ from synthetic_recordings import noisy
 import kineverse as kv
 from kineverse.estimation import KinematicGraph, identify_graph, pose_covariance
 from kineverse.estimation.identification.families import JOINT_FAMILIES, GroupMotion
-from kineverse.estimation.identification.kinematic_graph.graph import tree_path
-from kineverse.estimation.identification.kinematic_graph.loop_closures import (
+from kineverse.estimation.identification.kinematic_graph import identify_pair, tree_path
+from kineverse.estimation.identification.loop_closures import (
     CONSTRAINED_COMPONENTS,
     ClosureEquations,
     ObservedLoop,
@@ -24,7 +24,6 @@ from kineverse.estimation.identification.kinematic_graph.loop_closures import (
     close_loops,
     resolve,
 )
-from kineverse.estimation.identification.kinematic_graph.pairwise import identify_pair
 from kineverse.estimation.identification.observations import check_tracks, exact_track
 
 Array = npt.NDArray[np.float64]

@@ -11,7 +11,7 @@ from scipy import integrate, stats
 
 import kineverse as kv
 from kineverse.estimation import PlausibilityMonitor, check_plausibility, identify, pose_covariance
-from kineverse.estimation.identification.joint_values import GRID
+from kineverse.estimation.identification.marginal_likelihood import GRID
 from kineverse.estimation.identification.observations import check_observations
 from kineverse.estimation.plausibility.alternatives import log_displacement_gain, log_evidence
 from kineverse.estimation.plausibility.e_process import SequentialTest

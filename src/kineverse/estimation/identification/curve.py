@@ -44,7 +44,8 @@ from kineverse.spatial import translation
 
 from .least_squares import Solution, levenberg_marquardt
 from .marginal_likelihood import Scored, laplace_evidence
-from .motion_model import FamilyMember, LinearisedPoses, ParameterPrior
+from .motion_functions import FamilyMember, ParameterPrior
+from .native import LinearisedPoses
 from .observations import Observations
 
 CURVE = "curve"  # name of the family

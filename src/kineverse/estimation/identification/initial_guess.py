@@ -14,7 +14,7 @@ from kineverse.lie import Array, inverse, log_so3, mean_rotation, rotation_along
 
 from .families import JOINT_FAMILIES, VZ, WZ, GroupMotion, JointFamily
 from .least_squares import InitialGuess, Solution
-from .motion_model import FamilyMember
+from .motion_functions import FamilyMember
 from .observations import Observations
 
 ARC_RADII = (2.0, 8.0)

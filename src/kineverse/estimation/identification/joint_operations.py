@@ -37,7 +37,7 @@ from kineverse.symbols import Symbol, position
 
 from .curve import CurveMotion
 from .families import Family, FamilyMotion, GroupMotion
-from .motion_model import FamilyMember
+from .motion_functions import FamilyMember
 
 _Z = (0.0, 0.0, 1.0)
 

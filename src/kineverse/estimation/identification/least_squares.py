@@ -26,8 +26,8 @@ from kineverse.estimation.linear_algebra import (
 )
 from kineverse.lie import Array, exp_so3, log_so3, skew, transform
 
-from .motion_functions import GeneratedMotion
-from .motion_model import FamilyMember, LinearisedPoses, MotionModel, ParameterPrior
+from .motion_functions import FamilyMember, GeneratedMotion, MotionModel, ParameterPrior
+from .native import LinearisedPoses
 from .observations import Observations
 
 if TYPE_CHECKING:

@@ -39,7 +39,7 @@ from .model_selection import (
     solve_with_inliers,
     weigh_families,
 )
-from .motion_model import FamilyMember
+from .motion_functions import FamilyMember
 from .noise_estimation import (
     STATED_NOISE,
     NoisePosterior,

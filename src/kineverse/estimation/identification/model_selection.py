@@ -27,15 +27,16 @@ from kineverse.lie import Array, transform
 
 from .families import REACH, Family, GroupMotion, family_starts
 from .initial_guess import CONTAINED, MotionStatistics, initial_guesses, widened_guess
-from .joint_values import (
+from .least_squares import InitialGuess, Solution
+from .marginal_likelihood import (
     LITTLE,
+    Scored,
+    laplace_evidence,
     log_unwrapping_gain,
     unwrap_screw,
     unwrap_solution,
 )
-from .least_squares import InitialGuess, Solution
-from .marginal_likelihood import Scored, laplace_evidence
-from .motion_model import FamilyMember
+from .motion_functions import FamilyMember
 from .noise_estimation import (
     STATED_NOISE,
     NoisePosterior,

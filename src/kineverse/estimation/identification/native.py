@@ -9,7 +9,7 @@ from __future__ import annotations
 import ctypes
 import functools
 from operator import gt
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -22,10 +22,17 @@ from kineverse.lie import Array
 from kineverse.spatial import exp_so3, inverse, log_so3, transform
 from kineverse.symbols import Symbol
 
-from .motion_model import LinearisedPoses
-
 if TYPE_CHECKING:
     from .motion_functions import MotionForm
+
+
+class LinearisedPoses(NamedTuple):
+    """Relative poses and their derivatives."""
+
+    pose: Array  # parent_T_child, (N, 4, 4)
+    by_parameters: Array  # twists of the child in the parent's axes, (N, m, n)
+    by_joints: Array  # the same per unit of each joint value, (N, m, k)
+
 
 # No other path has to agree with these numbers to the last bit, so contraction is allowed.
 _FLAGS = ("-O3", "-ffp-contract=fast", "-fno-rounding-math", "-lm")

@@ -20,7 +20,7 @@ from kineverse.lie import Array, skew
 
 from .least_squares import InitialGuess, Solution
 from .marginal_likelihood import Scored
-from .motion_model import FamilyMember
+from .motion_functions import FamilyMember
 from .observations import Observations
 from .result import NoiseDeviations
 from .solver import solver

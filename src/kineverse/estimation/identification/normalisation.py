@@ -17,7 +17,7 @@ from kineverse.lie import Array, exp_so3, orthonormalize, rotation_along_z, tran
 from .curve import CurveMotion
 from .families import VZ, WX, WZ, FamilyMotion, GroupMotion
 from .least_squares import Solution
-from .motion_model import FamilyMember
+from .motion_functions import FamilyMember
 from .observations import Observations
 from .result import Fit
 

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from kineverse.errors import InvalidValueError, ShapeError
-from kineverse.estimation.pose_checks import as_numbers, check_covariances, check_finite, check_rigid
+from kineverse.estimation.noise import as_numbers, check_covariances, check_finite, check_rigid
 from kineverse.lie import Array, inverse, translation
 
 _THIN = 4.0  # factor between successive levels of the continuation
@@ -117,7 +117,7 @@ def check_observations(
 
 
 PosesLike: TypeAlias = "npt.ArrayLike | tuple[npt.ArrayLike, npt.ArrayLike]"
-"""Poses (N, 4, 4), or a pair of poses and covariance: a common one, see :mod:`.pose_checks`, or (N, 6, 6) of
+"""Poses (N, 4, 4), or a pair of poses and covariance: a common one, see :mod:`.noise`, or (N, 6, 6) of
 each pose. Where points are accepted, positions (N, 3)."""
 
 

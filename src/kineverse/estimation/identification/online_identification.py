@@ -17,8 +17,8 @@ from kineverse.estimation.noise import Outliers, as_outliers
 
 from .curve import CURVE
 from .joint_identification import Families, family_weights, resolve_noise
-from .joint_values import is_screw
 from .least_squares import InitialGuess
+from .marginal_likelihood import is_screw
 from .model_check import solve_joints, weigh_and_check
 from .model_selection import (
     FamilyName,

@@ -27,7 +27,7 @@ from kineverse.lie import Array
 
 from .least_squares import STEPS, InitialGuess, JointValuePrior, Solution
 from .marginal_likelihood import Scored
-from .motion_model import FamilyMember
+from .motion_functions import FamilyMember
 from .observations import Observations
 from .solver import solver
 

@@ -19,10 +19,9 @@ from kineverse.model.operation import Operation
 from .curve import CurveMotion
 from .families import GroupMotion
 from .joint_operations import joint_operation
-from .joint_values import find_revolving_joint, slide_child_origin
 from .least_squares import Solution, levenberg_marquardt
-from .marginal_likelihood import Evidence
-from .motion_model import FamilyMember, FixedMotion, MotionModel
+from .marginal_likelihood import Evidence, find_revolving_joint, slide_child_origin
+from .motion_functions import FamilyMember, FixedMotion, MotionModel
 from .observations import Observations
 from .outlier_rejection import classify_inliers
 

@@ -20,21 +20,22 @@ import numpy as np
 from kineverse.compilation.interruption import raise_signal
 from kineverse.lie import Array
 
-from . import joint_values, native
+from . import marginal_likelihood, native
 from .families import prepare_functions
-from .joint_values import PerObservation, has_sliding_point, narrow_translations
 from .least_squares import CLOSE, ROUGH, STEPS, InitialGuess, JointValuePrior, Solution, levenberg_marquardt
 from .marginal_likelihood import (
     Evidence,
     IntegratedValues,
+    PerObservation,
     Scored,
     evidence_excess,
     evidence_of,
+    has_sliding_point,
     integrate_joint_values,
+    narrow_translations,
 )
-from .motion_functions import GeneratedMotion, MotionForm
-from .motion_model import FamilyMember, LinearisedPoses, MotionModel
-from .native import Problem, library
+from .motion_functions import FamilyMember, GeneratedMotion, MotionForm, MotionModel
+from .native import LinearisedPoses, Problem, library
 from .observations import Observations
 
 _FIRST_STEPS = 2  # steps of each of several starts, before the best of them continues
@@ -178,8 +179,8 @@ def _problem(motion: MotionModel) -> Problem | None:
     known = None if form is None or not library.is_native else native.problem_of(form)
     if known is None:
         return None
-    problem, grid = Problem.from_buffer_copy(known), joint_values.GRID
-    problem.little, problem.widths, problem.grid = joint_values.LITTLE, len(grid), grid.ctypes.data
+    problem, grid = Problem.from_buffer_copy(known), marginal_likelihood.GRID
+    problem.little, problem.widths, problem.grid = marginal_likelihood.LITTLE, len(grid), grid.ctypes.data
     return problem
 
 

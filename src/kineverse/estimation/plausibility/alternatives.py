@@ -19,12 +19,12 @@ import numpy as np
 from kineverse._checks import as_tolerance
 from kineverse.errors import InvalidValueError, KineverseError
 from kineverse.estimation.correlation import CorrelationSettings
-from kineverse.estimation.identification.joint_values import GRID
-from kineverse.estimation.identification.kinematic_graph.pairwise import (
+from kineverse.estimation.identification.kinematic_graph import (
     LOG_ANYWHERE,
     FamilyChoice,
     identify_observations,
 )
+from kineverse.estimation.identification.marginal_likelihood import GRID
 from kineverse.estimation.identification.outlier_rejection import RowIndices, is_inlier
 from kineverse.estimation.identification.result import (
     SURE,

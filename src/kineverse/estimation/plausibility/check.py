@@ -14,7 +14,7 @@ import numpy.typing as npt
 from kineverse.errors import InvalidValueError, KineverseError, ShapeError, UnknownNameError, suggest
 from kineverse.estimation.correlation import CorrelationSettings, ErrorCorrelation
 from kineverse.estimation.identification import native
-from kineverse.estimation.identification.kinematic_graph.pairwise import FamilyChoice
+from kineverse.estimation.identification.kinematic_graph import FamilyChoice
 from kineverse.estimation.identification.observations import (
     PosesLike,
     PoseTrack,
@@ -24,8 +24,7 @@ from kineverse.estimation.identification.observations import (
     pair_tracks,
 )
 from kineverse.estimation.linear_algebra import singularity_named
-from kineverse.estimation.noise import Outliers, as_outliers
-from kineverse.estimation.pose_checks import as_numbers
+from kineverse.estimation.noise import Outliers, as_numbers, as_outliers
 from kineverse.estimation.tracking import Tracker
 from kineverse.estimation.tracking.measurements import require_time
 from kineverse.lie import Array

@@ -16,7 +16,8 @@ from kineverse.errors import FormatError
 from kineverse.formats.xml_values import LARGEST
 from kineverse.lie import Array, exp_so3, quaternion, rotation_angle, rpy, to_quaternion, transform
 
-from .columns import (
+from .recording import Indices, RecordedTrack, Recording, spaced_indices
+from .table import (
     COLUMN_HELP,
     UNITS,
     UNNAMED_COLUMNS,
@@ -24,10 +25,12 @@ from .columns import (
     YAW,
     Columns,
     PartColumns,
+    Table,
+    convert_frame,
+    is_number,
     parse_columns,
+    read_table,
 )
-from .recording import Indices, RecordedTrack, Recording, spaced_indices
-from .table import Table, convert_frame, is_number, read_table
 
 ROOM, FARTHEST = 50.0, 1000.0
 """Largest range of the positions of a part, and their largest coordinate, that are possible in a room [m]."""

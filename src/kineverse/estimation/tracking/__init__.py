@@ -8,7 +8,7 @@ if TYPE_CHECKING:
     from kineverse.estimation.noise import Outliers as Outliers
 
     from .estimate import Estimate as Estimate
-    from .hypothesis_bank import HypothesisBank as HypothesisBank
+    from .tracker import HypothesisBank as HypothesisBank
     from .measurements import (
         ObservedExpression as ObservedExpression,
         ObservedPose as ObservedPose,

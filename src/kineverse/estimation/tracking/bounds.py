@@ -18,10 +18,9 @@ from kineverse.model.constraint import Constraint
 from kineverse.model.rates import to_plain
 from kineverse.symbols import Symbol
 
-from .information_state import InformationState
 from .measurements import MeasurementModel
 from .process_model import ProcessModel
-from .state_space import Layout, TangentSpace, build_layout, build_tangent_space
+from .state_space import InformationState, Layout, TangentSpace, build_layout, build_tangent_space
 
 if TYPE_CHECKING:
     from kineverse.model.model_view import ModelView

@@ -18,11 +18,10 @@ from kineverse.model.model_view import ModelView
 from kineverse.state import State, StateLike
 from kineverse.symbols import Symbol
 
-from .gaussian_sum import GaussianSum
-from .gaussian_sum_filter import StepResult, UpdateStep
+from .gaussian_sum_filter import GaussianSum, StepResult, UpdateStep
 from .process_model import Speeds
 from .residuals import Measurements
-from .speed_update import Residual, SpeedValue
+from .speed_process import Residual, SpeedValue
 from .state_space import Layout
 
 Groups = npt.NDArray[np.bool_]

@@ -17,11 +17,9 @@ from kineverse.state import State, StateLike
 from kineverse.symbols import Symbol
 
 from .bounds import initial_deviations, initial_point
-from .gaussian_sum import GaussianSum
-from .gaussian_sum_filter import UpdateStep
-from .information_state import InformationState
+from .gaussian_sum_filter import GaussianSum, UpdateStep
 from .measurements import require_mapping, require_positive, wrap_difference
-from .state_space import CoordinateGroup, Layout
+from .state_space import CoordinateGroup, InformationState, Layout
 
 if TYPE_CHECKING:
     from kineverse.model.model_view import ModelView

@@ -19,10 +19,9 @@ from kineverse.estimation.noise import Outliers, cauchy_weight
 from kineverse.lie import Array
 
 from .bounds import BoundRows, GroupBounds, StateBounds, solve_bounded_qp
-from .information_state import InformationState, QuadraticCost
 from .process_model import ProcessModel
 from .residuals import Measurements, Residuals
-from .state_space import Layout
+from .state_space import InformationState, Layout, QuadraticCost
 
 # Iteration ends at steps below this many standard deviations.
 _CONVERGED = 1e-5

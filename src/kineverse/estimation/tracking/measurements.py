@@ -12,8 +12,7 @@ import numpy.typing as npt
 
 from kineverse._checks import finite_number
 from kineverse.errors import DuplicateNameError, InvalidValueError, ShapeError
-from kineverse.estimation.noise import pose_covariance
-from kineverse.estimation.pose_checks import as_numbers, check_covariance
+from kineverse.estimation.noise import as_numbers, check_covariance, pose_covariance
 from kineverse.expressions.expression import Expression, array
 from kineverse.lie import Array
 from kineverse.model.frame import WORLD
@@ -186,7 +185,7 @@ def wrap_difference(difference: Array, period: float) -> Array:
 
 
 def require_covariance(covariance: npt.ArrayLike, size: int, label: str) -> Array:
-    """Check a covariance, size × size, or one of its short forms; see :mod:`.pose_checks`."""
+    """Check a covariance, size × size, or one of its short forms; see :mod:`.noise`."""
     part = f"observation '{label}'"
     matrix = as_numbers(covariance, f"The covariance of the {part}")
     return check_covariance(matrix.reshape(1, 1) if matrix.size == size == 1 else matrix, size, part, 0.0)

@@ -16,13 +16,12 @@ import numpy as np
 
 from kineverse.compilation import CompiledFunction
 from kineverse.compilation.c_library import SourceLibrary, struct_fields
-from kineverse.estimation.pose_checks import RIGID
+from kineverse.estimation.noise import RIGID
 from kineverse.lie import Array
 
-from .information_state import InformationState
 from .map_update import Loss, MapResult, MapSolver
 from .residuals import Measurements
-from .state_space import Layout
+from .state_space import InformationState, Layout
 
 _MAX_UNKNOWNS, _MAX_MEASUREMENT_SIZE = 64, 64  # sizes of the arrays on the stack of the C code
 _LOSSES: tuple[Loss, ...] = ("gaussian", "cauchy", "mixture")  # in the order of the C code

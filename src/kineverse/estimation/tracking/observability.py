@@ -28,11 +28,10 @@ from kineverse.errors import KineverseError
 from kineverse.estimation.linear_algebra import inverse_spd
 from kineverse.lie import Array, pose_difference, retract
 
-from .information_state import InformationState, QuadraticCost
 from .map_update import MapResult
 from .measurements import MeasurementModel, wrap_difference
 from .residuals import Measurements, whitening
-from .state_space import CoordinateGroup, Layout
+from .state_space import CoordinateGroup, InformationState, Layout, QuadraticCost
 
 if TYPE_CHECKING:
     from .gaussian_sum_filter import UpdateStep

@@ -18,8 +18,7 @@ from kineverse.expressions.substitution import apply_substitution
 from kineverse.lie import Array
 from kineverse.symbols import Symbol
 
-from .information_state import InformationState
-from .state_space import Layout
+from .state_space import InformationState, Layout
 
 if TYPE_CHECKING:
     from .gaussian_sum_filter import UpdateStep

@@ -15,10 +15,10 @@ from kineverse.state import State, StateLike
 from .bounds import SpeedLocks
 from .estimate import Step, TrackerState, TrackLoss, find_refuted
 from .gaussian_sum_filter import StepResult, UpdateStep
-from .information_state import InformationState
 from .initialization import InitialBelief
 from .process_model import Speeds
-from .speed_update import SpeedUpdate
+from .speed_process import SpeedUpdate
+from .state_space import InformationState
 
 
 class FixedLag:

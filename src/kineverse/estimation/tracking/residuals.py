@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from kineverse.compilation import CompiledFunction
 from kineverse.errors import InvalidValueError, ShapeError, UnknownNameError, suggest
-from kineverse.estimation.pose_checks import as_numbers, check_covariances, check_rigid
+from kineverse.estimation.noise import as_numbers, check_covariances, check_rigid
 from kineverse.lie import Array, inverse_right_jacobian, pose_difference, transform
 
 from .measurements import MeasurementModel, require_covariance, wrap_difference

@@ -7,7 +7,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from dataclasses import dataclass
 from functools import reduce
 from itertools import combinations
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -22,7 +22,8 @@ from kineverse.model.basic_operations import AddFrame
 from kineverse.model.frame import Frame
 from kineverse.model.operation import Operation
 
-from .pairwise import PartPair
+if TYPE_CHECKING:
+    from .kinematic_graph import PartPair
 
 Times = npt.NDArray[np.int_]
 

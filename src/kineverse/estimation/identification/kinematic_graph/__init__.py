@@ -1,1 +1,0 @@
-"""Kinematic graph of many parts (Sturm et al. 2011)."""
