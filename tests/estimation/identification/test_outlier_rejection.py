@@ -85,6 +85,15 @@ def test_outliers_option_changes_nothing_without_outliers(family: str) -> None:
     assert other.probability == pytest.approx(one.probability, abs=0.02)
 
 
+def test_one_gross_error_makes_no_joint_of_a_part_at_rest() -> None:
+    # A screw leads through any two poses: that of the part, and the wrong one.
+    data = record_joint("rigid", 3, count=30)
+    child, wrong = with_wrong(data, 1 / 30, 5)
+    identified = identify(data.parent, child, noise=data.covariance, outliers=True)
+    assert identified.best.family == "rigid"
+    assert identified.best.outliers == tuple(wrong)
+
+
 @pytest.fixture(scope="module")
 def hinge() -> tuple[Recording, Array, Array, IdentificationResult]:
     data = record_joint("revolute", 1)

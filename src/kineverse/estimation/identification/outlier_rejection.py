@@ -74,9 +74,7 @@ def find_inliers(
     search = _InlierSearch(observations, outliers, stated)
     hypotheses = {name: search.hypothesis(one.solution) for name, one in solutions.items()}
     unsettled = [name for name, hypothesis in hypotheses.items() if not search.is_settled(hypothesis)]
-    simple = (name for name, one in solutions.items() if one.solution.motion.joints == 1)
-    # Where one path explains all observations, no family gains by leaving some out.
-    if not unsettled or not all(name in unsettled for name in simple):
+    if not unsettled:
         return dict.fromkeys(solutions, everything)
     supported = Counter(tuple(h.inliers) for h in hypotheses.values() if h.has_enough_inliers)
     common = [np.flatnonzero(inliers) for inliers, _ in supported.most_common(_SHARED)]

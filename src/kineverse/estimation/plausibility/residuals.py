@@ -19,12 +19,8 @@ from kineverse.estimation.identification.least_squares import (
     Solution,
     levenberg_marquardt,
 )
-from kineverse.estimation.identification.motion_functions import (
-    GeneratedMotion,
-    LinearisedPoses,
-    MotionForm,
-    generate,
-)
+from kineverse.estimation.identification.motion_functions import GeneratedMotion, MotionForm, generate
+from kineverse.estimation.identification.native import LinearisedPoses
 from kineverse.estimation.identification.observations import Observations
 from kineverse.estimation.identification.solver import solver
 from kineverse.estimation.linear_algebra import invert_matrices, log_determinants, multiply_vectors
