@@ -46,15 +46,20 @@ class TrackLoss:
     """Rejected measurements and refuted updates in a row."""
 
     rejected: npt.NDArray[np.int64]  # number of times in a row that each observation was rejected (m,)
-    refuted: npt.NDArray[
-        np.int64
-    ]  # updates in a row that refute an estimate, or minus those that agree (groups,)
+    refuted: npt.NDArray[np.int64]  # updates in a row that refute a group, less those that agree (groups,)
     is_lost: Groups  # True for each lost group (groups,)
+
+    @cached_property
+    def is_clear(self) -> bool:
+        """True if nothing was rejected, refuted or lost: then an update that agrees changes nothing."""
+        return not (self.rejected.any() or (self.refuted > 0).any() or self.is_lost.any())
 
     def after(
         self, layout: Layout, reading: Measurements, outliers: Sequence[int], refuted: Groups, lost_after: int
     ) -> TrackLoss:
         """Return the state after an update; a lost group stays lost until two in a row agree with it."""
+        if self.is_clear and not outliers and not refuted.any():
+            return self
         rejected, measured = self.rejected, find_measured(layout, reading)
         if outliers or rejected.any():
             rejected = np.where(reading.mask, 0, rejected)

@@ -30,6 +30,7 @@ from .observability import (
     find_unexplained,
     restart_states,
     turned_states,
+    turning_coordinates,
 )
 from .process_model import ProcessModel, Speeds
 from .residuals import MeasurementReader, Measurements, Residuals
@@ -284,8 +285,11 @@ class UpdateStep:
                 raise
             return [], 0  # a gross error is too far away for least squares
         if self.outliers is None:
-            unexplained = find_unexplained(result)
-            settled = [n for n in single if n not in unexplained] if unexplained else single
+            # Other points of a group may explain what its residuals leave.
+            beyond = find_unexplained(result)
+            unobserved = self._find_unobserved(belief, result, beyond)
+            ambiguous = {*unobserved, *(n for n in beyond if turning_coordinates(self, n))}
+            settled = [n for n in single if n not in ambiguous] if ambiguous else single
         else:
             are_certain = self._are_inliers(belief, result, reading, self.outliers)
             settled = [number for number in single if are_certain[number]]
@@ -502,10 +506,11 @@ class UpdateStep:
         if is_best:
             wrong = {*self._group_of[reading.mask & (result.weights < 0.5)].tolist()}
             rejected = [n for n in groups if n in wrong]
-            unexplained = {*self._find_unobserved(belief, result), *rejected}
+            beyond = find_unexplained(result)
+            unexplained = {*self._find_unobserved(belief, result, beyond), *rejected}
             again = [n for n in groups if n in unexplained]
             starts = [(start, again) for start in restart_states(self, belief, result.belief, again, inputs)]
-            turned = find_unexplained(result) if self.outliers is None else rejected
+            turned = beyond if self.outliers is None else rejected
             starts += turned_states(self, belief, result.belief, reading, inputs, turned)
             candidates += itertools.chain.from_iterable(
                 self._restart_from(start, reading, inputs, some) for start, some in starts
@@ -519,10 +524,12 @@ class UpdateStep:
         candidates.append(Candidate(all_outliers, np.zeros(len(reading.mask)), none, none, groups))
         return candidates, rounds
 
-    def _find_unobserved(self, before: InformationState, result: MapResult) -> list[int]:
-        """Return the groups whose residuals exceed the noise and that have unobservable directions."""
-        records, is_in, beyond = before.records, self.unobservable.is_in, find_unexplained(result)
-        return [n for n in beyond if records[n] is not None or is_in(n, result.belief)]
+    def _find_unobserved(
+        self, before: InformationState, result: MapResult, groups: Iterable[int]
+    ) -> list[int]:
+        """Return those of some groups that have, or had, unobservable directions."""
+        records, is_in = before.records, self.unobservable.is_in
+        return [n for n in groups if records[n] is not None or is_in(n, result.belief)]
 
 
 def _require_finite(*arrays: Array) -> None:

@@ -121,6 +121,19 @@ def restart_states(
     return beliefs
 
 
+def turning_coordinates(step: UpdateStep, number: int) -> list[int]:
+    """Return the unlimited coordinates of a group whose turns its measurements may tell, by their index."""
+    group, limits, coordinates = (
+        step.layout.groups[number],
+        step.limits,
+        step.layout.tangent_space.coordinates,
+    )
+    if group.by_speeds:
+        return []
+    free = group.x[np.isinf(limits.lower[group.x]) & np.isinf(limits.upper[group.x])].tolist()
+    return [i for i in free if coordinates[i] not in step.periods]
+
+
 def turned_states(
     step: UpdateStep,
     before: InformationState,
@@ -130,11 +143,9 @@ def turned_states(
     groups: Sequence[int],
 ) -> list[tuple[InformationState, list[int]]]:
     """Return prior beliefs on other turns of unlimited coordinates, as of a pinion, with their group."""
-    result, layout, limits = [], step.layout, step.limits
-    for number, i in [(n, i) for n in groups for i in layout.groups[n].x.tolist()]:
-        group, is_free = layout.groups[number], np.isinf(limits.lower[i]) and np.isinf(limits.upper[i])
-        if group.by_speeds or not is_free or layout.tangent_space.coordinates[i] in step.periods:
-            continue
+    result = []
+    for number, i in [(n, i) for n in groups for i in turning_coordinates(step, n)]:
+        group = step.layout.groups[number]
         place, errors = after.x.copy(), []
         for turn in (0.0, math.tau):
             place[i] = after.x[i] + turn
