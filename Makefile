@@ -12,6 +12,7 @@ INSTALL_FILES = printf '%s\n' $(filter %.txt,$^) | xargs -P $(JOBS) -I {} $(INST
 
 # What the demo and every command in the README need.
 DEMO := $(patsubst %,requirements/%.txt,geometry core view figures build control recording exchange)
+TEST := $(patsubst %,requirements/%.txt,peers test learning usd check)
 
 # Where there are wheels of ROS 2, and what tf2_msgs is compiled with; elsewhere tests of real nodes are skipped.
 WHEELS := $(shell $(PYTHON) -c 'import platform as p; print(p.system(), p.machine(), *p.python_version_tuple()[:2])')
@@ -75,7 +76,7 @@ $(VENV)/demo.installed: $(DEMO) pyproject.toml studies/pyproject.toml ros/kineve
 	$(INSTALL) --no-build-isolation --editable . --editable studies --editable ros/kineverse_ros
 	@touch $@
 
-$(VENV)/test.installed: requirements/peers.txt requirements/test.txt $(VENV)/demo.installed | $(BIN)/python
+$(VENV)/test.installed: $(TEST) $(VENV)/demo.installed | $(BIN)/python
 	@echo "Installing what the tests need into $(VENV); this takes a minute, once."
 	@$(INSTALL_FILES)
 	@touch $@
