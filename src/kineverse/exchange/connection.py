@@ -403,9 +403,8 @@ class Connection:
         server = f"The server {self.address.name!r}"
         end = time.monotonic() + (_LOOKING if self.user and self.is_online else 0.0)
         is_there = False
-        while (
-            not is_there and time.monotonic() < end
-        ):  # for moments after a connection was made, nobody is seen
+        # For moments after a connection was made, nobody is seen.
+        while not is_there and time.monotonic() < end:
             is_there = self.transport.is_alive(self.key("alive/*"), _LOOKING)
             time.sleep(0.0 if is_there else _PAUSE)
         if is_there:
