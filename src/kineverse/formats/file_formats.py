@@ -55,6 +55,8 @@ def list_file_formats() -> tuple[FileFormat, ...]:
             name="SDF",
             suffixes=(".sdf", ".world"),
             read=f"{formats}.sdf.operations:sdf_file_operations",
+            written=(".sdf",),
+            write=f"{formats}.sdf.writer:to_sdf",
             loop_element="joint",
             reference=b"include",
         ),
