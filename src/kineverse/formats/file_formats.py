@@ -39,6 +39,7 @@ def list_file_formats() -> tuple[FileFormat, ...]:
             read=f"{formats}.urdf.operations:urdf_file_operations",
             written=(".urdf",),
             write=f"{formats}.urdf.writer:to_urdf",
+            engine=f"{formats}.engines:PinocchioEngine",
             recognize=_is_urdf,
         ),
         FileFormat(
@@ -47,6 +48,7 @@ def list_file_formats() -> tuple[FileFormat, ...]:
             read=f"{formats}.mjcf.operations:mjcf_file_operations",
             written=(".xml", ".mjcf"),
             write=f"{formats}.mjcf.writer:to_mjcf",
+            engine=f"{formats}.engines:MujocoEngine",
             recognize=is_mjcf,
             loop_element="equality",
             reference=b"file",
@@ -57,6 +59,7 @@ def list_file_formats() -> tuple[FileFormat, ...]:
             read=f"{formats}.sdf.operations:sdf_file_operations",
             written=(".sdf",),
             write=f"{formats}.sdf.writer:to_sdf",
+            engine=f"{formats}.engines:DrakeEngine",
             loop_element="joint",
             reference=b"include",
         ),
