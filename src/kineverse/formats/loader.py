@@ -196,6 +196,17 @@ def include(
     return list(_applied(edit, found, _content(found), prefix, _root(found, root), strict, loops, given))
 
 
+def check_readable(content: bytes, path: Path) -> None:
+    """Check that what a writer would write to a file is read again, with its loops."""
+    source = Source(path)
+    try:
+        with collect_warnings(), no_collection(), Model().edit() as edit:
+            for _ in _applied(edit, source, content, None, _root(source, None), False, "solve", {}):
+                pass
+    except KineverseError as error:
+        raise FormatError(f"What would be written cannot be read again: {error}") from error
+
+
 def _arguments(
     source: str | os.PathLike[str], arguments: Mapping[str, object] | None
 ) -> tuple[str | os.PathLike[str], dict[str, str]]:

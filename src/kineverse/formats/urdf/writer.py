@@ -17,9 +17,7 @@ from typing import Any
 import numpy as np
 from msgspec.structs import replace
 
-from kineverse._runtime import no_collection
 from kineverse.articulations.multi_axis import rotation_from_z
-from kineverse.errors import FormatError, KineverseError
 from kineverse.formats.description import (
     IDENTITY_COEFFICIENTS,
     BallJointDescription,
@@ -29,12 +27,13 @@ from kineverse.formats.description import (
     Matrix,
     RobotDescription,
     WrittenFile,
+    dynamics_number,
 )
 from kineverse.formats.export.capabilities import FormatCapabilities, UnsupportedFeatures
 from kineverse.formats.export.link_tree import LinkTreeBuilder, check_rotation
+from kineverse.formats.loader import check_readable
 from kineverse.formats.names import TakenNames
 from kineverse.formats.poses import IDENTITY, ROTATION_TOLERANCE, rpy_angles
-from kineverse.formats.reader_warnings import collect_warnings
 from kineverse.formats.resource_paths import mesh_reference
 from kineverse.formats.xml_writer import Tag, format_xml
 from kineverse.lie import translation
@@ -53,12 +52,8 @@ from kineverse.model.body import (
     Sphere,
 )
 from kineverse.model.frame import WORLD
-from kineverse.model.model import Model
 from kineverse.model.model_view import ModelView
 from kineverse.symbols import Symbol
-
-from .operations import urdf_operations
-from .reader import parse_urdf
 
 _TENSOR = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 
@@ -171,7 +166,7 @@ def to_urdf(
     if loose:
         _loosen_links(description)
     content = UrdfWriter(description, path, builder.unsupported).document()
-    _check_read_back(content, path)
+    check_readable(content, path)
     return WrittenFile(content, tuple(description.remarks), description.errors, builder.unsupported.left_out)
 
 
@@ -188,17 +183,6 @@ def _loosen_links(description: RobotDescription) -> None:
     for link in description.links:
         if any(isinstance(joint, JointDescription) and joint.symbol not in single for joint in link.joints):
             link.is_loose = True
-
-
-def _check_read_back(content: bytes, path: Path) -> None:
-    model = Model()
-    try:
-        with collect_warnings(), model.edit() as edit, no_collection():
-            robot = parse_urdf(content, path.name, str(path.absolute().parent))
-            for operation in urdf_operations(robot):
-                edit.apply(operation)
-    except KineverseError as error:
-        raise FormatError(f"What would be written cannot be read again: {error}") from error
 
 
 class UrdfWriter:
@@ -355,15 +339,19 @@ class UrdfWriter:
         self, element: Tag, name: str, known: Mapping[str, Any], soft: tuple[float, float] | None = None
     ) -> None:
         if known.get("damping") or known.get("friction"):
-            element.add("dynamics", damping=_number(known, "damping"), friction=_number(known, "friction"))
+            element.add(
+                "dynamics",
+                damping=dynamics_number(known, "damping"),
+                friction=dynamics_number(known, "friction"),
+            )
         if soft is not None or "k_velocity" in known:
             lower, upper = soft or (None, None)
             element.add(
                 "safety_controller",
                 soft_lower_limit=lower,
                 soft_upper_limit=upper,
-                k_position=_number(known, "k_position"),
-                k_velocity=_number(known, "k_velocity") or 0.0,
+                k_position=dynamics_number(known, "k_position"),
+                k_velocity=dynamics_number(known, "k_velocity") or 0.0,
             )
         for key in known:
             if key not in _KNOWN:
@@ -372,8 +360,8 @@ class UrdfWriter:
     def _limit(
         self, element: Tag, name: str, kind: str, bounds: JointBounds, known: Mapping[str, Any]
     ) -> None:
-        effort, max_velocity = _number(known, "effort"), bounds.max_velocity
-        newer = {key: _number(known, key) for key in _NEWER}
+        effort, max_velocity = dynamics_number(known, "effort"), bounds.max_velocity
+        newer = {key: dynamics_number(known, key) for key in _NEWER}
         has_range = kind in ("revolute", "prismatic") or not bounds.is_unbounded
         if not has_range and effort is None and max_velocity == math.inf and not any(newer.values()):
             return
@@ -404,8 +392,3 @@ class UrdfWriter:
 
 def _axis_key(joint: JointDescription) -> tuple[str, bool, tuple[float, ...]]:
     return joint.name, joint.is_rotation, joint.axis
-
-
-def _number(dynamics: object, key: str) -> float | None:
-    value = dynamics.get(key) if isinstance(dynamics, dict) else None
-    return float(value) if isinstance(value, (int, float)) and not math.isnan(value) else None
