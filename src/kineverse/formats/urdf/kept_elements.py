@@ -22,7 +22,7 @@ from kineverse.formats.xml_reader import Element
 from kineverse.formats.xml_writer import Tag, escape_attribute
 from kineverse.model.body import Rgba
 
-DATUM = "urdf"  # last part of the name of the datum, behind the name of the root link
+DATUM = "urdf"  # last part of the name of the datum, behind the name of a link
 
 KNOWN_PARTS: Mapping[str, frozenset[str]] = {
     "robot": frozenset(("link", "joint", "material")),
@@ -57,13 +57,14 @@ class KeptElement(_Record, frozen=True):
 class KeptParts(_Record, frozen=True, tag=DATUM):
     """Parts of one URDF that its model does not say.
 
-    ``visuals`` has for each link the name of the material of each visual, and whether it is defined there.
-    ``names`` are those of all links and joints in the file, which elements may name, and ``renamed`` are
-    those that have another name in the model.
+    ``robot`` is the name of the robot, and ``anchor`` the link that the datum is named for. ``visuals`` has
+    for each link the name of the material of each visual, and whether it is defined there. ``names`` are
+    those of all links and joints in the file, which elements may name, and ``renamed`` are those that have
+    another name in the model.
     """
 
     robot: str
-    root: str
+    anchor: str = ""
     namespaces: tuple[tuple[str, str], ...] = ()
     materials: tuple[KeptMaterial, ...] = ()
     visuals: tuple[tuple[str, tuple[tuple[str, bool], ...]], ...] = ()
@@ -89,7 +90,7 @@ def read_kept_parts(data: Mapping[str, Any]) -> Iterator[tuple[str, str, KeptPar
             parts = msgspec.convert(value, KeptParts)
         except msgspec.ValidationError:
             continue
-        own = f"{parts.root}/{DATUM}"
+        own = f"{parts.anchor}/{DATUM}"
         if name == own or name.endswith(f"/{own}"):
             yield name, name.removesuffix(own), parts
 

@@ -101,11 +101,12 @@ def urdf_operations(
         yield from _joint_operations(joint, frame_name, joint_name)
         if joint.child in bodies:
             yield SetBody(frame_name(joint.child), bodies[joint.child])
-    if robot.kept is not None:
+    # The world is in many models, so its first child names what is kept of a robot that begins there.
+    anchors = [robot.root] if root != WORLD else [joint.child for joint in robot.joints]
+    if robot.kept is not None and anchors:
         changed = {k: v for k, v in {**links, **joints}.items() if v != drop_empty_parts(k)}
-        kept = structs.replace(robot.kept, root=links[robot.root], renamed=tuple(changed.items()))
-        name = f"{kept.root}/{DATUM}"
-        yield SetData(f"{prefix}/{name}" if prefix else name, kept.as_datum())
+        kept = structs.replace(robot.kept, anchor=links[anchors[0]], renamed=tuple(changed.items()))
+        yield SetData(f"{frame_name(anchors[0])}/{DATUM}", kept.as_datum())
 
 
 def _joint_operations(

@@ -90,7 +90,7 @@ def parse_urdf(
     links = tuple(document.links.values())
     roots, ordered, reached = order_from_root(links, joints, remarks, hint)
     name = top[1].get("name", "")
-    kept = document.kept_parts(text, top, roots[0])
+    kept = document.kept_parts(text, top)
     return UrdfRobot(
         name,
         roots[0],
@@ -138,7 +138,7 @@ class _Document:
             raise empty.located(self.remarks.source)
         return hint
 
-    def kept_parts(self, text: str | bytes, top: Element, root: str) -> KeptParts:
+    def kept_parts(self, text: str | bytes, top: Element) -> KeptParts:
         """Return the parts of the document that its links and joints do not say."""
         visuals = (
             (link, tuple(found.get(k, ("", False)) for k in range(max(found) + 1)))
@@ -153,7 +153,7 @@ class _Document:
             else:
                 elements = tuple(find_elements(plain, self._owners, self._xacro))
         names = tuple(dict.fromkeys((*self.links, *self.joints))) if elements else ()
-        kept = KeptParts(top[1].get("name", ""), root, namespaces, tuple(self._reader.materials.defined))
+        kept = KeptParts(top[1].get("name", ""), "", namespaces, tuple(self._reader.materials.defined))
         return structs.replace(kept, visuals=tuple(visuals), elements=elements, names=names)
 
     def _read_element(self, element: Element) -> None:
