@@ -97,7 +97,7 @@ class PinocchioEngine(PoseEngine):
         except (ValueError, RuntimeError, ElementTree.ParseError) as error:
             raise self.refuse(error) from None
         self._data = self._model.createData()
-        self._joints = {joint.get("name", ""): joint for joint in root.iter("joint")}
+        self._joints = {joint.get("name", ""): joint for joint in root.findall("joint")}
         skipped = set(self._links_below_tilted_planes())
         body = self._pin.FrameType.BODY
         known = {f.name: k for k, f in enumerate(self._model.frames) if f.type == body}

@@ -15,6 +15,7 @@ class FormatCapabilities:
     sum_limits: bool = False  # True if the format limits linear combinations of coordinates
     one_way_speeds: bool = False  # True if the velocity limits of the two directions may differ
     loop_joints: bool = False
+    keeps_urdf_elements: bool = False  # True if it writes elements again that a URDF had and no model says
     polynomial_degree: int = 1  # highest degree of the polynomials by which a joint may follow another
 
 

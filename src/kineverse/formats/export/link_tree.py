@@ -24,6 +24,7 @@ from kineverse.formats.description import (
 )
 from kineverse.formats.names import TakenNames
 from kineverse.formats.poses import ROTATION_TOLERANCE, rotation_deviation
+from kineverse.formats.urdf.kept_elements import describe_elements, read_kept_parts
 from kineverse.intervals.graph import TermGraph
 from kineverse.loops.equations import AXES
 from kineverse.loops.loop_records import LOOP_KINDS, LoopRecord, find_loops
@@ -448,8 +449,13 @@ class LinkTreeBuilder:
             )
 
     def _add_remarks(self) -> None:
-        if self.model.data:
-            self.remarks.append(f"data are not written: {list_some(self.model.data, 4)}")
+        kept = {name for name, _, _ in read_kept_parts(self.model.data)}
+        data = [name for name in self.model.data if name not in kept]
+        if data:
+            self.remarks.append(f"data are not written: {list_some(data, 4)}")
+        elements = describe_elements(self.model.data)
+        if elements and not self.capabilities.keeps_urdf_elements:
+            self.remarks.append(f"elements of URDF that say nothing of motion are not written: {elements}")
         for name in self._left_out:
             self.remarks.append(f"'{name}' is left out, as asked for")
 

@@ -9,7 +9,7 @@ coordinate. A joint between two frames closes a loop.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -30,8 +30,9 @@ from kineverse.formats.description import (
 from kineverse.formats.export.capabilities import FormatCapabilities, UnsupportedFeatures
 from kineverse.formats.export.link_tree import LinkTreeBuilder, check_rotation
 from kineverse.formats.loader import check_readable
+from kineverse.formats.loop_closures import CLOSED
 from kineverse.formats.names import TakenNames
-from kineverse.formats.poses import pose_from_quaternion
+from kineverse.formats.poses import ROTATION_TOLERANCE, pose_from_quaternion
 from kineverse.formats.xml_writer import Tag, format_numbers, format_xml
 from kineverse.lie import translation
 from kineverse.model.body import NO_BODY, Vector3
@@ -72,15 +73,33 @@ def to_sdf(
     builder = LinkTreeBuilder(model, SDF_CAPABILITIES, leave_out, tolerance, strict)
     description = builder.build()
     home = {s.path: value for s, value in builder.home_positions().items()}
-    content = SdfWriter(description, path, builder.unsupported, home).document()
+    looped = set(_check_closed(model, description.loops, home, builder.unsupported))
+    content = SdfWriter(description, path, builder.unsupported, home, looped).document()
     check_readable(content, path)
     return WrittenFile(content, tuple(description.remarks), description.errors, builder.unsupported.left_out)
+
+
+def _check_closed(
+    model: ModelView, loops: Iterable[LoopJoint], home: Mapping[str, float], unsupported: UnsupportedFeatures
+) -> Iterator[str]:
+    """Yield the coordinates of loops; refuse a loop that is open at home, where SDF would close it."""
+    for loop in loops:
+        yield from (parse_symbol_name(name)[0] for name in (*loop.free, *loop.dependent))
+        for frame, to in loop.ends:
+            pose = model.fk(frame, to)
+            yield from (symbol.path for symbol in pose.symbols if symbol.path in home)
+            gap = pose({symbol: home.get(symbol.path, symbol.value) for symbol in pose.symbols}) - np.eye(4)
+            rows = gap[:3, 3] if loop.kind == "connect" else gap
+            if np.abs(rows).max() > CLOSED:
+                unsupported.refuse(
+                    loop.name, "is open at home, and SDF closes a loop at the poses of the file"
+                )
 
 
 class SdfWriter:
     """Writer of one robot description as SDF.
 
-    ``home`` is the home position of every coordinate, by its path.
+    ``home`` is the home position of every coordinate, by its path, and ``looped`` are those in loops.
     """
 
     def __init__(
@@ -89,7 +108,9 @@ class SdfWriter:
         path: Path,
         unsupported: UnsupportedFeatures,
         home: Mapping[str, float],
+        looped: Collection[str],
     ) -> None:
+        self._looped = looped
         self._description, self._path, self._unsupported, self._home = description, path, unsupported, home
         self._bodies = SdfBodyWriter(path.absolute().parent, description.remarks)
         name = allowed_name(path.name.removesuffix(path.suffix) or "model")
@@ -102,9 +123,6 @@ class SdfWriter:
             if self._frames[link.name] != link.name:
                 self._renamed[link.name] = self._frames[link.name]
         self._axes: dict[str, tuple[str, str]] = {}
-        self._looped = {
-            parse_symbol_name(name)[0] for loop in description.loops for name in (*loop.free, *loop.dependent)
-        }
         self._joints = {id(link): self._plan(link) for link in description.links}
 
     def document(self) -> bytes:
@@ -416,8 +434,10 @@ def _screw_pitch(turn: JointDescription, slide: JointDescription) -> float:
         or slide.coefficients[0]
     ):
         return 0.0
-    along = {turn.axis: 1.0, _opposite(turn.axis): -1.0}.get(slide.axis, 0.0)
-    return along * slide.coefficients[1] * math.tau
+    for sign in (1.0, -1.0):
+        if np.abs(np.subtract(turn.axis, np.multiply(slide.axis, sign))).max() <= ROTATION_TOLERANCE:
+            return sign * slide.coefficients[1] * math.tau
+    return 0.0
 
 
 def _is_universal(first: JointDescription, second: JointDescription, name: str) -> bool:
@@ -431,11 +451,6 @@ def _is_universal(first: JointDescription, second: JointDescription, name: str) 
         and first.point == second.point
         and cosine <= _PERPENDICULAR
     )
-
-
-def _opposite(axis: Vector3) -> Vector3:
-    x, y, z = axis
-    return 0.0 - x, 0.0 - y, 0.0 - z
 
 
 def _motion_in_link(joint: _SdfJoint, zero: Sequence[float]) -> Matrix:
