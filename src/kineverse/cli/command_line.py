@@ -70,7 +70,7 @@ COMMANDS: Mapping[str, tuple[str, str]] = MappingProxyType(
             "live:LEARN",
             "learn joints that nobody has described in a live system, and doubt known ones",
         ),
-        "keys": ("keys", "make the keys of a model server and its users, for other computers"),
+        "keys": ("exchange:KEYS", "make the keys of a model server and its users, for other computers"),
         "relay": ("exchange:RELAY", "relay a site's clients to a model server elsewhere"),
         "ls": ("exchange:LS", "list the model servers of this user"),
         "status": ("exchange:STATUS", "print how a model server is: times, clients, refused edits"),

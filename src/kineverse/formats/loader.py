@@ -15,7 +15,7 @@ from kineverse.model import registry
 from kineverse.model.edit import Edit
 from kineverse.model.history import HistoryEntry
 from kineverse.model.model import Model, Snapshot
-from kineverse.model.registry import FileContent, FileFormat, LoopTreatment, check_loops
+from kineverse.model.registry import FileContent, FileFormat, LoopTreatment, SourceFile, check_loops
 from kineverse.symbols import Symbol
 
 from .file_formats import DOCUMENT_SUFFIXES
@@ -234,6 +234,8 @@ def _applied(
     prefix = source.shipped if prefix is None else prefix
     file_format = _format(source, content)
     if file_format is not None:
+        digest = hashlib.blake2b(content).digest()
+        edit.record_source(SourceFile(source.path, digest, prefix or None, root, source.shipped))
         file = FileContent(source.path, content, prefix or None, root, strict, source.shipped, arguments)
         operations = file_format.operations(file)
     else:

@@ -51,6 +51,16 @@ class FileContent(Struct, frozen=True):
     arguments: Mapping[str, str] = field(default_factory=dict)  # arguments of a template, by name
 
 
+class SourceFile(Struct, frozen=True):
+    """File that a model was loaded from, and how it was read."""
+
+    path: Path
+    digest: bytes  # BLAKE2b of its bytes
+    prefix: str | None = None  # prefix of all names
+    root: str = ""  # folder below which it opened further files
+    shipped: str | None = None  # name of the model if it comes with the package
+
+
 class FileFormat(Struct, frozen=True):
     """File format of models, with its reader and its writer."""
 
