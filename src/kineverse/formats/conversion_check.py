@@ -19,7 +19,6 @@ from kineverse.model.sampling import StateSamples
 from .engines import PoseEngine, rotation_angle
 from .export.link_tree import sort_parents_first
 
-EQUAL = 1e-9  # largest difference of a pose [m], [rad] that counts as rounding
 STATES = 100
 
 
@@ -74,7 +73,8 @@ def check_conversion(
     """Compare the poses of all frames of a model with those of a file, in an engine of its own.
 
     The engine is pinocchio for URDF, MuJoCo for MJCF and drake for SDF. It reads the file with its own
-    parser, and gets the values of all coordinates in each state, of dependent ones as well.
+    parser, and gets the values of all coordinates in each state, of dependent ones as well. OpenUSD reads
+    USD and has no kinematics: they are those of :func:`kineverse.formats.usd.stage_poses`.
 
     Parameters
     ----------
@@ -82,7 +82,7 @@ def check_conversion(
         Number of states: the default state, and random ones within limits, the same in every call.
     bounds
         Allowed differences of approximated frames [m], [rad], as in ``errors`` of the result of a save; other
-        frames may differ by 1e-9.
+        frames may differ by 1e-9, those of USD by 1e-6.
 
     Raises
     ------
@@ -111,8 +111,10 @@ def check_conversion(
         name: FrameDeviation(float(p), float(a)) for name, p, a in zip(names, distance, angle, strict=True)
     }
     allowed = dict(bounds or {})
-    wrong = {name: error for name, error in errors.items() if _exceeds(error, allowed.get(name))}
-    gaps = {name: gap for name, gap in engine.closures().items() if _exceeds(gap, None)}
+    wrong = {
+        name: error for name, error in errors.items() if _exceeds(error, allowed.get(name), engine.equal)
+    }
+    gaps = {name: gap for name, gap in engine.closures().items() if _exceeds(gap, None, engine.equal)}
     joints = {record.child: name for name, record in model.articulations.items()}
     worst = max(errors, key=lambda name: max(errors[name].position, errors[name].angle), default="")
     first = next(iter(wrong), "")
@@ -131,9 +133,9 @@ def check_conversion(
     )
 
 
-def _exceeds(error: FrameDeviation, bound: FrameDeviation | None) -> bool:
+def _exceeds(error: FrameDeviation, bound: FrameDeviation | None, equal: float) -> bool:
     """Return whether an error is above its bound; one that is no number is."""
-    position, angle = (EQUAL, EQUAL) if bound is None else (bound.position + EQUAL, bound.angle + EQUAL)
+    position, angle = (equal, equal) if bound is None else (bound.position + equal, bound.angle + equal)
     return not (error.position <= position and error.angle <= angle)
 
 

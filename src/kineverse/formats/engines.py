@@ -41,6 +41,7 @@ class PoseEngine(ABC):
 
     package: ClassVar[str]  # name of its package in Python
     distribution: ClassVar[str]  # name under which it is installed
+    equal: ClassVar[float] = 1e-9  # largest difference of a pose [m], [rad] that counts as rounding
 
     def __init__(self, path: Path) -> None:
         self.path = path
