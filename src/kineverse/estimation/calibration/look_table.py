@@ -11,7 +11,8 @@ import math
 import os
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from difflib import get_close_matches
 from typing import Any
 
 import numpy as np
@@ -20,10 +21,10 @@ from kineverse.compilation import compile
 from kineverse.errors import FormatError, UnknownNameError, list_some, suggest
 from kineverse.estimation.recordings.reader import open_table, parse_units, read_tracks
 from kineverse.estimation.recordings.recording import Indices, RecordedTrack, Recording
-from kineverse.estimation.recordings.table import UNITS, Table, is_number
+from kineverse.estimation.recordings.table import UNITS, Table, is_number, parse_column
 from kineverse.estimation.tracking.measurements import ObservedPosition
 from kineverse.expressions.expression import ExpressionLike
-from kineverse.lie import Array, rotation_angle, rotation_of
+from kineverse.lie import Array, quaternion, rotation_angle, rotation_of, to_quaternion, transform
 from kineverse.model.frame import WORLD
 from kineverse.model.model_view import ModelView
 from kineverse.symbols import Symbol
@@ -32,7 +33,8 @@ from .observations import Look, ObservedPixel
 
 _LOOKS = 60  # largest number of looks of which all pairs are compared
 _DECISIVE = 3.0  # ratio of misfits that decides between two readings
-_DIFFERENT = math.radians(3.0)  # least difference of two readings' angles that matters
+_NOTHING = math.radians(0.1)  # angle that makes no difference between two readings [rad]
+_DOUBTFUL = 0.2  # median misfit above which joints and what was seen hardly belong together [rad]
 _UNIT = re.compile(r"(?P<name>.*?)\s*[\[(]\s*(?P<unit>[^\[\]()]*?)\s*[\])]\s*|(?P<bare>.*?)")
 _JOINT = re.compile(r"(?:.*?joint_states?[./])?(?:positions?[./:])?(?P<name>.*?)(?:[./:]positions?)?")
 _PIXEL = re.compile(r"(?:(?P<frame>.*?)[./:_ ])?(?P<axis>[uv])")
@@ -52,12 +54,15 @@ class LookTable:
         What the table leaves open, such as "joint values in deg".
     ignored
         Names of columns without meaning.
+    remarks
+        Doubts about the table.
     """
 
     looks: tuple[Look, ...]
     lines: tuple[int, ...]
     assumptions: tuple[str, ...] = ()
     ignored: tuple[str, ...] = ()
+    remarks: tuple[str, ...] = ()
 
 
 def read_looks(
@@ -147,6 +152,8 @@ class _LookReader:
             ignored = recording.ignored
             tracks = self._named(recording, observed, reference)
         values, kept = self._joint_values(joints, state, tracks)
+        self._check_complete(values, state, [(frame, seen_in) for frame, seen_in, _ in tracks])
+        remarks = self._check_turns(tracks, values, state)
         for frame, seen_in, track in tracks:
             key: Any = (frame, seen_in)
             if not track.has_orientation:
@@ -163,7 +170,8 @@ class _LookReader:
             given: dict[Symbol | str, float] = {**state, **{s: float(v[row]) for s, v in values.items()}}
             looks.append(Look(given, observations[row]))
         lines = tuple(int(self.table.lines[row]) for row in rows)
-        return LookTable(tuple(looks), lines, tuple(dict.fromkeys(self.assumed)), ignored)
+        hinted = tuple(map(self._with_hint, ignored))
+        return LookTable(tuple(looks), lines, tuple(dict.fromkeys(self.assumed)), hinted, remarks)
 
     # -- columns ---------------------------------------------------------------------------------------------
 
@@ -189,7 +197,7 @@ class _LookReader:
             symbols = [str(s) for s in self.model.symbols]
             raise UnknownNameError(
                 f"{self.table.source}: no column is a joint of the model; the columns are "
-                f"{list_some(map(repr, self.names), 8)}. {suggest(self.names[0], symbols, 'joint')}"
+                f"{list_some(map(repr, self.names), 8)}. Joints are {list_some(symbols, 8)}."
             )
         return joints, pixels, rest
 
@@ -201,8 +209,10 @@ class _LookReader:
         """Return the coordinate that a column's name stands for; None if there is none."""
         inner = _JOINT.fullmatch(text)
         for name in dict.fromkeys((text, inner["name"] if inner else text)):
-            exact = [s for s in self.model.symbols if str(s) == name]
-            ends = exact or [s for s in self.model.symbols if str(s).endswith(f"/{name}")]
+            ends = [s for s in self.model.symbols if str(s) == name]
+            ends = ends or [s for s in self.model.symbols if str(s).partition("/")[2] == name]
+            if not parse_column(name, self.table.source).quantity:  # else it may be that of another base's x
+                ends = ends or [s for s in self.model.symbols if str(s).endswith(f"/{name}")]
             if name and len(ends) == 1:
                 return ends[0]
             if name and len(ends) > 1:
@@ -219,9 +229,14 @@ class _LookReader:
             return ends[0]
         if ends:
             raise UnknownNameError(f"{what} '{text}' may be {list_some(ends, 4)}. Write the whole name.")
-        raise UnknownNameError(
-            f"{what} '{text}' is no frame of the model. {suggest(text, self.frames, 'frame')}"
-        )
+        short = [frame.partition("/")[2] or frame for frame in self.frames]
+        raise UnknownNameError(f"{what} '{text}' is no frame of the model. {suggest(text, short, 'frame')}")
+
+    def _with_hint(self, column: str) -> str:
+        """Return the name of a column without meaning, with the joint that may be meant."""
+        names = {str(s).partition("/")[2] or str(s): None for s in self.model.symbols}
+        near = get_close_matches(self._split_unit(column)[0], names, 1, 0.8)
+        return f"{column} (is '{near[0]}' meant?)" if near else column
 
     # -- poses -----------------------------------------------------------------------------------------------
 
@@ -268,8 +283,8 @@ class _LookReader:
         for name, track in recording.tracks.items():
             if not name and observed is None:
                 raise FormatError(
-                    f"{self.table.source} does not say which frame was seen: name it, observed= (and "
-                    "relative_to= for the frame that it was seen in)."
+                    f"{self.table.source} does not say which frame was seen: name it by observed= , and the "
+                    "one that it was seen in by relative_to= , if that is not the world."
                 )
             frame = self._frame(observed if observed and len(recording.tracks) == 1 else name, "The part")
             seen_in = reference or (self._frame(track.frame, "The frame_id") if track.frame else WORLD)
@@ -352,6 +367,51 @@ class _LookReader:
             return False
         return any(float(np.nanmax(np.abs(values[s]))) > 2.0 * math.pi for s in angles)
 
+    def _check_complete(
+        self,
+        values: Mapping[Symbol, Array],
+        state: Mapping[Symbol | str, float],
+        seen: Sequence[tuple[str, str]],
+    ) -> None:
+        """Check that all joints between a frame and where it was seen have values."""
+        known = {*map(str, values), *map(str, state)}
+        for frame, seen_in in seen:
+            used = self.model.fk(frame, relative_to=seen_in).symbols
+            missing = [str(s) for s in used if s.has_derivative and s.order == 0 and str(s) not in known]
+            if missing:
+                raise UnknownNameError(
+                    f"{self.table.source}: '{frame}' as seen in '{seen_in}' depends on "
+                    f"{list_some(missing, 4)}, which no column has. If they stay the same in all looks, give "
+                    "their values: state="
+                )
+
+    def _check_turns(
+        self,
+        tracks: Sequence[tuple[str, str, RecordedTrack]],
+        values: Mapping[Symbol, Array],
+        state: Mapping[Symbol | str, float],
+    ) -> tuple[str, ...]:
+        """Refuse quaternions in the wrong order; return a remark if nothing turns as the joints do."""
+        plain = self._misfit(tracks, values, state)
+        if plain < _DOUBTFUL:
+            return ()
+        turned = [
+            (frame, seen_in, replace(track, poses=_reordered_quaternions(track.poses)))
+            for frame, seen_in, track in tracks
+            if track.has_orientation
+        ]
+        if plain > _DECISIVE * self._misfit(turned, values, state):
+            raise FormatError(
+                f"{self.table.source}: what was seen turns as the joints do if its quaternions are w, x, y, "
+                "z, though their columns are called qx, qy, qz, qw. Correct the first line, or name the "
+                "columns in their order, by columns="
+            )
+        angle = math.degrees(plain)
+        return (
+            f"what was seen does not turn as the joints do: by {angle:.0f} deg more or less, in the median. "
+            "Do the rows belong together, and is it the pose of the frame in the other one, not the inverse?",
+        )
+
     def _misfit(
         self,
         tracks: Sequence[tuple[str, str, RecordedTrack]],
@@ -360,7 +420,8 @@ class _LookReader:
     ) -> float:
         """Return the median difference of the angles between looks, seen and by the joints [rad].
 
-        R_i = C⁻¹ A(q_i) M is seen, so R_i R_jᵀ turns by the angle of A_i A_jᵀ for all mounts C and M.
+        R_i = C⁻¹ A(q_i) M is seen. So products of R_i R_jᵀ turn by the angle of those of A_i A_jᵀ, for all
+        mounts C and M. They are products of two, since the order of quaternions leaves the angle of one.
         """
         known = {str(s): v for s, v in state.items()}
         misfits = []
@@ -382,9 +443,11 @@ class _LookReader:
                 continue
             predicted, seen = function.batch(columns[some]), rotation_of(track.poses[some])
             a, b = np.triu_indices(len(some), 1)
-            angles = [rotation_angle(r[a] @ np.swapaxes(r[b], 1, 2)) for r in (np.asarray(predicted), seen)]
+            other = np.random.default_rng(0).permutation(len(a))
+            turns = [r[a] @ np.swapaxes(r[b], 1, 2) for r in (np.asarray(predicted), seen)]
+            angles = [rotation_angle(turn @ turn[other]) for turn in turns]
             misfits.append(float(np.median(np.abs(angles[0] - angles[1]))))
-        return max(misfits, default=0.0) + math.radians(0.1)
+        return max(misfits, default=0.0) + _NOTHING
 
     # -- pixels ----------------------------------------------------------------------------------------------
 
@@ -416,3 +479,10 @@ class _LookReader:
         for row in np.flatnonzero(np.isfinite(u) & np.isfinite(v)).tolist():
             pixel = float(u[row]), float(v[row])
             observations[row].append(ObservedPixel(frame, camera, pixel, focal=focal, centre=centre))
+
+
+def _reordered_quaternions(poses: Array) -> Array:
+    """Return poses (N, 4, 4) whose quaternions were w, x, y, z where x, y, z, w was read."""
+    quaternions = to_quaternion(poses[:, :3, :3])
+    # The sign of a quaternion says nothing, so reordering its numbers is as good as it is from the file.
+    return transform(quaternion(np.roll(quaternions, -1, axis=1)), poses[:, :3, 3])
