@@ -59,6 +59,7 @@ COMMANDS: Mapping[str, tuple[str, str]] = MappingProxyType(
         ),
         "spheres": ("spheres", "cover collision shapes by spheres, and show how far these stick out"),
         "fit": ("fit", "identify the joint of a part from a table of its poses"),
+        "calibrate": ("calibrate", "correct joints, mounts and lengths of a model by what was seen"),
         "serve": ("serve", "serve a model that other processes read and edit, and keep it"),
         "world": (
             "live:WORLD",

@@ -1,4 +1,4 @@
-"""Commands about model servers: ``ls``, ``status``, ``watch``, ``history``, ``undo``, ``dump``, ``apply``, ``keys``."""
+"""Commands about model servers: ``ls``, ``status``, ``watch``, ``history``, ``undo``, ``keys`` and others."""
 
 from __future__ import annotations
 

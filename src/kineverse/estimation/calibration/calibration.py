@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple, TypeAlias
@@ -14,10 +15,12 @@ import numpy.typing as npt
 from kineverse._checks import as_count, as_positive
 from kineverse.errors import InvalidValueError, UnknownNameError, list_some, suggest
 from kineverse.estimation.noise import Outliers, as_outliers
+from kineverse.formats.saver import save_corrections
 from kineverse.lie import Array
 from kineverse.model.edit import Edit
 from kineverse.model.model import Model
 from kineverse.model.operation import Operation
+from kineverse.model.registry import SaveResult
 from kineverse.state import State
 from kineverse.symbols import Symbol, parameter
 
@@ -123,6 +126,7 @@ class Calibration:
     operations: Mapping[str, Operation]
     units: Mapping[str, str]
     calibrated: Mapping[str, Operation] = field(repr=False)  # operations before, by tag
+    model: Model = field(repr=False)  # the model that was calibrated
 
     def apply(self, model: Model) -> int:
         """Replace the operations of a model by the corrected ones, in one edit; return its new version.
@@ -143,6 +147,34 @@ class Calibration:
         with model.edit() as edit:
             self.write(edit)
         return model.version
+
+    def save(
+        self, path: str | os.PathLike[str], *, source: str | os.PathLike[str] | None = None
+    ) -> SaveResult:
+        """Write the corrected model to a file, in the format of its ending.
+
+        A URDF is the file that the model was loaded from, with other numbers for corrected origins and axes;
+        all its other bytes are as they were. The remarks say what it has no number for, such as the radius of
+        a wheel. A document (``.kv.json``) holds all corrections. Other files are written as by
+        :meth:`.Model.save`.
+
+        Parameters
+        ----------
+        path
+            File to write.
+        source
+            URDF that the model was made of, if it is not known or one of several.
+
+        Raises
+        ------
+        FormatError
+            If the URDF is a template of xacro, has changed since it was loaded, or is not that of the model.
+        InvalidValueError
+            If the model has been edited since the calibration at what is corrected.
+        """
+        corrected = self.model.copy()
+        self.apply(corrected)
+        return save_corrections(corrected, self.calibrated, self.operations, path, source)
 
     def write(self, edit: Edit) -> None:
         """Replace the operations within an edit."""
@@ -463,6 +495,7 @@ def _result(
         operations,
         {str(u.outer): u.unit for u in unknowns},
         {tag: model.history.operation(tag) for tag in operations},
+        model,
     )
 
 
