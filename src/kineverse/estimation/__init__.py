@@ -14,8 +14,11 @@ if TYPE_CHECKING:
     from .calibration import (
         Calibration as Calibration,
         Look as Look,
+        LookTable as LookTable,
         ObservedPixel as ObservedPixel,
+        WheelOdometry as WheelOdometry,
         calibrate as calibrate,
+        read_looks as read_looks,
     )
     from .identification import (
         Family as Family,

@@ -6,6 +6,7 @@ from kineverse._lazy import lazy_face
 
 if TYPE_CHECKING:
     from .calibration import Calibration as Calibration, calibrate as calibrate
+    from .look_table import LookTable as LookTable, read_looks as read_looks
     from .observations import (
         BlockSource as BlockSource,
         Look as Look,
@@ -13,5 +14,6 @@ if TYPE_CHECKING:
         ObservedPixel as ObservedPixel,
         ResidualBlock as ResidualBlock,
     )
+    from .odometry import WheelOdometry as WheelOdometry
 
 lazy_face(__name__)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -15,10 +16,12 @@ import numpy.typing as npt
 from kineverse._checks import as_count, as_positive
 from kineverse.errors import DuplicateNameError, InvalidValueError, UnknownNameError, list_some, suggest
 from kineverse.estimation.noise import Outliers, as_outliers
+from kineverse.formats.saver import save_corrections
 from kineverse.lie import Array
 from kineverse.model.edit import Edit
 from kineverse.model.model import Model
 from kineverse.model.operation import Operation
+from kineverse.model.registry import SaveResult
 from kineverse.state import State
 from kineverse.symbols import Symbol, parameter
 
@@ -27,7 +30,7 @@ from .corrections import (
     corrected_operation,
     find_corrections,
     parameterised_operation,
-    replace_parameters,
+    with_parameters,
 )
 from .hand_eye import start_mounts
 from .observations import (
@@ -120,6 +123,7 @@ class Calibration:
     looks: int
     units: Mapping[str, str]
     calibrated: Mapping[str, Operation] = field(repr=False)  # operations before, by tag
+    model: Model = field(repr=False)  # the model that was calibrated
     corrections: tuple[Correction, ...] = field(repr=False)
 
     @cached_property
@@ -132,7 +136,7 @@ class Calibration:
             own = [i for i, correction in enumerate(self.corrections) if correction.tag == tag]
             numbers = [values[i].tolist() for i in own]
             corrected = corrected_operation(operation, [self.corrections[i] for i in own], numbers)
-            result[tag] = replace_parameters(corrected, new)
+            result[tag] = with_parameters(corrected, new)
         return result
 
     def apply(self, model: Model) -> int:
@@ -141,7 +145,8 @@ class Calibration:
         Raises
         ------
         InvalidValueError
-            If the model's operations are not those that were calibrated, as after a first ``apply``.
+            If the model's operations are not those that were calibrated, as after a first ``apply``, or a
+            free symbol stands in an operation without its class.
         """
         for tag, operation in self.calibrated.items():
             entry = model.history.entries.get(tag)
@@ -151,9 +156,44 @@ class Calibration:
                     f"The calibration does not fit this model: its operation {tag!r} {how}. Calibrate the "
                     "model as it is now, or undo the change."
                 )
+        old = [s for s in self.state if not self.units[str(s)]]
         with model.edit() as edit:
             self.write(edit)
+            left = [str(s) for s in old if s in edit.model.symbols and s.value != self.state[s]]
+            if left:
+                raise InvalidValueError(
+                    f"The value of {list_some(map(repr, left), 4)} cannot be set in this model: it stands in "
+                    "operations of a document without their classes. Pass calibration.state with the values."
+                )
         return model.version
+
+    def save(
+        self, path: str | os.PathLike[str], *, source: str | os.PathLike[str] | None = None
+    ) -> SaveResult:
+        """Write the corrected model to a file, in the format of its ending.
+
+        A URDF is the file that the model was loaded from, with other numbers for corrected origins and axes;
+        all its other bytes are as they were. The remarks say what it has no number for, such as the radius of
+        a wheel. A document (``.kv.json``) holds all corrections. Other files are written as by
+        :meth:`.Model.save`.
+
+        Parameters
+        ----------
+        path
+            File to write.
+        source
+            URDF that the model was made of, if it is not known or one of several.
+
+        Raises
+        ------
+        FormatError
+            If the URDF is a template of xacro, has changed since it was loaded, or is not that of the model.
+        InvalidValueError
+            If the model has been edited since the calibration at what is corrected.
+        """
+        corrected = self.model.copy()
+        self.apply(corrected)
+        return save_corrections(corrected, self.calibrated, self.operations, path, source)
 
     def write(self, edit: Edit) -> None:
         """Replace the operations within an edit."""
@@ -528,7 +568,7 @@ def _result(
     new = {u.inner: parameter(u.inner.path, math.pi) for u in unknowns if not u.inner.has_derivative}
     if new:
         ours = {tag: model.history.operation(tag) for tag in model.history.tags}
-        tags |= {tag for tag, one in ours.items() if replace_parameters(one, new) is not one}
+        tags |= {tag for tag, one in ours.items() if with_parameters(one, new) is not one}
     outliers = tuple(
         Outlier(int(block.looks[k]), block.label, float(weights[k]))
         for block, weights in zip(problem.blocks, fit.weights, strict=True)
@@ -548,6 +588,7 @@ def _result(
         len(looks),
         {str(u.outer): u.unit for u in unknowns},
         {tag: model.history.operation(tag) for tag in model.history.tags if tag in tags},
+        model,
         tuple(prepared.corrections),
     )
 
