@@ -105,14 +105,14 @@ def check_statistics(seeds: range, bad: float, most: float, nees: tuple[float, f
     assert ratio <= most
     assert nees[0] <= consistency <= nees[1]
     for name, true in zip(("position", "orientation"), NOISE, strict=True):
-        assert np.mean([size[name] for size in sizes]) == pytest.approx(true, rel=0.03)
+        assert np.mean([size[name] for size in sizes]) == pytest.approx(true, rel=0.04)
     assert mistakes == 0
 
 
 @pytest.mark.parametrize("bad", [0.0, 0.1])
 def test_errors_are_near_the_bound_and_of_the_stated_size(bad: float) -> None:
-    # 10 draws of 13 errors: standard deviations are 6 % of the RMSE and 12 % of the NEES.
-    check_statistics(range(100, 110), bad, 1.15, (0.7, 1.35))
+    # 6 draws of 13 errors: standard deviations are 8 % of the RMSE and 16 % of the NEES.
+    check_statistics(range(100, 106), bad, 1.2, (0.6, 1.45))
 
 
 @pytest.mark.long
