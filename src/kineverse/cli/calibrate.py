@@ -328,7 +328,8 @@ def _format(
         looks = sorted({outlier.look for outlier in found.outliers})
         shown_lines = ", ".join(str(table.lines[k]) for k in looks[:_SHOWN])
         more = ", …" if len(looks) > _SHOWN else ""
-        lines.append(f"\ngross errors, left out: {len(found.outliers)}, in lines {shown_lines}{more}")
+        where = "line" if len(looks) == 1 else "lines"
+        lines.append(f"\ngross errors, left out: {len(found.outliers)}, in {where} {shown_lines}{more}")
     if found.unobservable:
         lines.append("\nnot told by these looks, and as before:")
         lines += [f"  {_format_direction(direction)}" for direction in found.unobservable]

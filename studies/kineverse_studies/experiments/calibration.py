@@ -84,7 +84,9 @@ def differences(function: Callable[[Array], Array], at: Array) -> Array:
 def bound_of(jacobian: Array, deviations: Array) -> Array:
     """Return the Cramér-Rao bound of parameters for independent normal errors."""
     scaled = jacobian / deviations[:, None]
-    return np.asarray(np.linalg.inv(scaled.T @ scaled))
+    sizes = np.linalg.norm(scaled, axis=0)  # of pixels and radians
+    triangle = np.linalg.inv(np.linalg.qr(scaled / sizes, mode="r"))
+    return np.asarray(triangle @ triangle.T / np.outer(sizes, sizes))
 
 
 # -- an arm that a camera sees -------------------------------------------------------------------------------
