@@ -60,9 +60,9 @@ class _Word(NamedTuple):
 
 def _origin(operation: Any) -> Factors:
     """Return the factors of the pose that a placed operation gives its frame at coordinate 0."""
-    factors: Factors = (
-        (operation.origin,) if isinstance(operation, PlacedOperation) else operation.frame.factors  # type: ignore[assignment]
-    )
+    if isinstance(operation, PlacedOperation):
+        return (_as_pose(operation.origin),)
+    factors: Factors = operation.frame.factors
     return factors
 
 
@@ -346,7 +346,7 @@ def _matching(model: Model, word: str, pattern: str) -> list[Correction]:
     matching = {name: tag for name, tag in tags.items() if fnmatchcase(name, pattern)}
     if not matching:
         kind = "joint or frame" if kinds[0] in ("mount", "length") else "joint"
-        raise UnknownNameError(f"Nothing is named '{pattern}'. {suggest(pattern, tags, kind)}")
+        raise UnknownNameError(f"No {kind} is named '{pattern}'. {suggest(pattern, tags, kind)}")
     result: dict[str, Correction] = {}
     for name, tag in matching.items():
         operation = _inner(model.history.operation(tag)) if tag else None
