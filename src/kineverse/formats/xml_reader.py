@@ -275,6 +275,18 @@ def _commented(data: str | bytes, on_recoverable_error: XmlFaultHandler) -> str 
     return b"".join([*pieces, content[start:]]) if pieces else data
 
 
+def decode_xml(data: str | bytes) -> str | None:
+    """Return the text of a document; None if it cannot be decoded."""
+    if isinstance(data, str):
+        return data
+    said = _ENCODING.search(data[:_CHUNK_BYTES].replace(b"\0", b"").partition(b"?>")[0])
+    encoding = "utf-8-sig" if said is None else said[1].decode()
+    try:
+        return data.decode(encoding)
+    except (UnicodeDecodeError, LookupError):
+        return None
+
+
 def read_name(element: Element) -> str:
     """Return the name of an element."""
     name = element[1].get("name")

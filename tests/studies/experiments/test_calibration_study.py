@@ -67,7 +67,7 @@ def test_a_bound_of_parameters_in_unlike_units():
 def test_the_report():
     made = report(*measure(lambda items, what, unit: items, 1, 1, 1))
     errors, hand_eye = made.tables
-    assert [row[0] for row in errors.rows][0] == "arm and camera"
+    assert errors.rows[0][0] == "arm and camera"
     assert len(errors.rows) == 5
     assert all(0.2 < float(row[3]) < 3.0 for row in errors.rows)
     assert len(hand_eye.rows) == 2 * len(SETTINGS)

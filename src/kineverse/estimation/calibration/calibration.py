@@ -30,7 +30,7 @@ from .corrections import (
     corrected_operation,
     find_corrections,
     parameterised_operation,
-    replace_parameters,
+    with_parameters,
 )
 from .hand_eye import start_mounts
 from .observations import (
@@ -123,8 +123,8 @@ class Calibration:
     looks: int
     units: Mapping[str, str]
     calibrated: Mapping[str, Operation] = field(repr=False)  # operations before, by tag
-    corrections: tuple[Correction, ...] = field(repr=False)
     model: Model = field(repr=False)  # the model that was calibrated
+    corrections: tuple[Correction, ...] = field(repr=False)
 
     @cached_property
     def operations(self) -> Mapping[str, Operation]:
@@ -136,7 +136,7 @@ class Calibration:
             own = [i for i, correction in enumerate(self.corrections) if correction.tag == tag]
             numbers = [values[i].tolist() for i in own]
             corrected = corrected_operation(operation, [self.corrections[i] for i in own], numbers)
-            result[tag] = replace_parameters(corrected, new)
+            result[tag] = with_parameters(corrected, new)
         return result
 
     def apply(self, model: Model) -> int:
@@ -145,7 +145,8 @@ class Calibration:
         Raises
         ------
         InvalidValueError
-            If the model's operations are not those that were calibrated, as after a first ``apply``.
+            If the model's operations are not those that were calibrated, as after a first ``apply``, or a
+            free symbol stands in an operation without its class.
         """
         for tag, operation in self.calibrated.items():
             entry = model.history.entries.get(tag)
@@ -155,8 +156,15 @@ class Calibration:
                     f"The calibration does not fit this model: its operation {tag!r} {how}. Calibrate the "
                     "model as it is now, or undo the change."
                 )
+        old = [s for s in self.state if not self.units[str(s)]]
         with model.edit() as edit:
             self.write(edit)
+            left = [str(s) for s in old if s in edit.model.symbols and s.value != self.state[s]]
+            if left:
+                raise InvalidValueError(
+                    f"The value of {list_some(map(repr, left), 4)} cannot be set in this model: it stands in "
+                    "operations of a document without their classes. Pass calibration.state with the values."
+                )
         return model.version
 
     def save(
@@ -553,7 +561,7 @@ def _result(
     new = {u.inner: parameter(u.inner.path, math.pi) for u in unknowns if not u.inner.has_derivative}
     if new:
         ours = {tag: model.history.operation(tag) for tag in model.history.tags}
-        tags |= {tag for tag, one in ours.items() if replace_parameters(one, new) is not one}
+        tags |= {tag for tag, one in ours.items() if with_parameters(one, new) is not one}
     outliers = tuple(
         Outlier(int(block.looks[k]), block.label, float(weights[k]))
         for block, weights in zip(problem.blocks, fit.weights, strict=True)
@@ -573,8 +581,8 @@ def _result(
         len(looks),
         {str(u.outer): u.unit for u in unknowns},
         {tag: model.history.operation(tag) for tag in model.history.tags if tag in tags},
-        tuple(prepared.corrections),
         model,
+        tuple(prepared.corrections),
     )
 
 

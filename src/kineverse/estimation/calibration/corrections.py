@@ -298,8 +298,18 @@ def _kind(correction: Correction, operation: Operation) -> str:
     return "mecanum" if correction.word == "wheels" and isinstance(operation, Mecanum) else correction.word
 
 
+def with_parameters(operation: Operation, new: Mapping[Symbol, Symbol]) -> Operation:
+    """Return an operation with parameters replaced by others of other values; itself if it has none."""
+    if isinstance(operation, Override):
+        inner = with_parameters(operation.operation, new)
+        return operation if inner is operation.operation else replace(operation, operation=inner)
+    mine = operation.rebuild() or operation
+    replaced: Operation = replace_parameters(mine, new)
+    return operation if replaced is mine else replaced
+
+
 def replace_parameters(value: Any, new: Mapping[Symbol, Symbol]) -> Any:
-    """Return a field of an operation, or an operation, with parameters replaced by others of other values."""
+    """Return a field with parameters replaced by others of other values; itself if it has none."""
     if isinstance(value, Expression):
         return value.substitute(new) if any(symbol in new for symbol in value.symbols) else value
     if isinstance(value, tuple):

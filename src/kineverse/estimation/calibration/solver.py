@@ -81,10 +81,10 @@ class CalibrationProblem:
         ]  # ½ log |S| of stated covariances
         self.log_outlier = [0.0 if outliers is None else b.log_outlier_density(outliers) for b in blocks]
         sized = [block for block, w in zip(blocks, self.whiten, strict=True) if w is None]
-        groups = {group.name: group for block in sized for group in block.groups}
-        self.known = {name: stated[name] for name in groups if name in stated}
-        self.unknown = sorted(groups.keys() - self.known.keys())
-        self.medians = {name: one.median for name, one in groups.items() if one.median is not None}
+        groups = [group for block in sized for group in block.groups]
+        self.known = {group.name: stated[group.name] for group in groups if group.name in stated}
+        self.unknown = sorted({group.name for group in groups} - self.known.keys())
+        self.medians = {group.name: group.median for group in groups if group.median is not None}
 
     def linearise(self, values: Array) -> list[Linearised]:
         """Return residuals and Jacobians of all blocks at scaled values."""
