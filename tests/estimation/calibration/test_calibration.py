@@ -162,7 +162,27 @@ def test_the_last_joint_and_an_unknown_marker_are_one_direction_each() -> None:
     (other,) = (one for one in told if roll in one)
     assert "pr2/r_gripper_palm_joint/rx" in other
     assert result.deviations["pr2/l_elbow_flex_joint/offset"] == np.inf
-    assert abs(result.state["pr2/l_elbow_flex_joint/offset"]) < 1e-12
+    assert result.state["pr2/l_elbow_flex_joint/offset"] == 0.0
+    assert "not told by the data: pr2/l_elbow_flex_joint/offset\n" in str(result)
+
+
+def test_a_symbol_that_is_not_told_keeps_its_value() -> None:
+    """The reach of the tip and the length of a tool behind it are told only together."""
+    tool = kv.parameter("tool", 0.7)
+    model = MACHINE.copy()
+    with model.edit() as edit:
+        edit.add_frame("tool", "tip", kv.translation(tool, 0, 0))
+    looks = []
+    for q in np.linspace(-1, 1, 9).tolist():
+        state = {"shoulder": q, "elbow": -q, "spindle": 2 * q}
+        where = {kv.position(name): value for name, value in state.items()} | {REACH: 0.45, tool: 0.7}
+        looks.append((state, {"tool": model.fk("tool")(where)}))
+    result = calibrate(model, looks, [REACH, tool])
+    (direction,) = result.unobservable
+    assert set(direction) == {"reach", "tool"}
+    assert result.state[REACH] + result.state[tool] == pytest.approx(1.15, abs=1e-8)
+    # Directions are scaled by the present values: each takes its share by the square of it.
+    assert result.state[REACH] - 0.4 == pytest.approx(0.05 * 0.4**2 / (0.4**2 + 0.7**2), abs=1e-8)
 
 
 def test_noise_is_estimated_or_used_as_it_is() -> None:

@@ -209,7 +209,9 @@ class Calibration:
         if self.outliers:
             looks = sorted({outlier.look for outlier in self.outliers})
             lines.append(f"{len(self.outliers)} gross errors, in looks {list_some(looks, 12)}")
-        lines += [f"not told by the data: {format_direction(one)}" for one in self.unobservable]
+        alone = [name for one in self.unobservable if len(one) == 1 for name in one]
+        lines += [f"not told by the data: {', '.join(alone)}"] if alone else []
+        lines += [f"not told by the data: {format_direction(d)}" for d in self.unobservable if len(d) > 1]
         return "\n".join(lines)
 
 
@@ -226,7 +228,7 @@ _GROUP_UNITS = {"position": "m", "point": "m", "orientation": "rad", "pixel": "p
 def _format(value: float, deviation: float, unit: str) -> str:
     factor, shown = SHOWN_UNITS.get(unit, (1.0, unit))
     if math.isinf(deviation):
-        return f"{factor * value:+.6g} {shown}, not told alone".replace("  ", " ")
+        return f"{factor * value:+.4g} {shown}".rstrip() + ", not told"
     return f"{factor * value:+.4g} ± {factor * deviation:.2g} {shown}".rstrip()
 
 
@@ -306,7 +308,7 @@ def calibrate(
             "No observation depends on what is free: "
             f"{list_some((str(u.outer) for u in unknowns), 6)}. Free something between the observed frames."
         )
-    fit = problem.solve(_start(problem, prepared, place, present) / scales)
+    fit = problem.solve(_start(problem, prepared, place, present) / scales, present / scales)
     _check_explained(problem, fit)
     return _result(model, prepared, problem, fit, before, folds)
 
@@ -552,7 +554,9 @@ def _result(
     folds: int,
 ) -> Calibration:
     unknowns, scales = prepared.unknowns, problem.scales
-    values = fit.values * scales
+    # What no observation depends on is exactly as it was.
+    present = np.array([u.outer.value or 0.0 for u in unknowns])
+    values = np.where(np.diag(fit.hessian) > 0.0, fit.values * scales, present)
     names = [str(u.outer) for u in unknowns]
     covariance = pseudo_inverse(fit.hessian)[0] * np.outer(scales, scales)
     directions, deviations = _directions(problem, fit)

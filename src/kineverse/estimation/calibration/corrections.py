@@ -355,8 +355,9 @@ def _matching(model: Model, word: str, pattern: str) -> list[Correction]:
         tags = {**{name: _writer(model, "frames", name) for name in model.frames}, **tags}
     matching = {name: tag for name, tag in tags.items() if fnmatchcase(name, pattern)}
     if not matching:
-        kind = "joint or frame" if kinds[0] in ("mount", "length") else "joint"
-        raise UnknownNameError(f"No {kind} is named '{pattern}'. {suggest(pattern, tags, kind)}")
+        kind = "joints and frames" if kinds[0] in ("mount", "length") else "joints"
+        hint = suggest(pattern, tags, "such name")
+        raise UnknownNameError(f"Nothing is named '{pattern}' among the {kind}. {hint}")
     result: dict[str, Correction] = {}
     for name, tag in matching.items():
         operation = _inner(model.history.operation(tag)) if tag else None

@@ -172,15 +172,14 @@ class CalibrationProblem:
         linear: Sequence[Linearised],
         weights: Sequence[Array],
         noise: Mapping[str, float],
-        equations: Weighted,
+        freedom: dict[str, float],
     ) -> dict[str, float]:
-        """Return the sizes of the noise at which weighted residuals have the expected squares."""
-        result = {**noise}
-        if not self.unknown:
-            return result
-        covariance = pseudo_inverse(equations.hessian)[0]
+        """Return the sizes of the noise at which weighted residuals have the expected squares.
+
+        ``freedom`` are the degrees of freedom that the parameters take from each group.
+        """
+        result, freedom = {**noise}, {name: -freedom[name] for name in self.unknown}
         squares = dict.fromkeys(self.unknown, 0.0)
-        freedom = {name: -float(np.sum(covariance * equations.parts[name])) for name in self.unknown}
         for i, one in enumerate(linear):
             if self.whiten[i] is None:
                 for group in self.blocks[i].groups:
@@ -195,18 +194,20 @@ class CalibrationProblem:
 
     # -- solutions ---------------------------------------------------------------------------------------
 
-    def solve(self, start: Array) -> CalibrationFit:
-        """Return the most likely parameters from a start."""
+    def solve(self, start: Array, present: Array) -> CalibrationFit:
+        """Return the most likely parameters from a start; those that nothing tells are the present ones."""
         values, linear = self._approach(start)
         # From above, so that no observation of few is lost at once.
         noise = {n: max(size, self.medians.get(n, 0.0)) for n, size in self.median_noise(linear).items()}
         noise |= self.known
         weights, cost = self.mixture(linear, noise)
         for _ in range(_STEPS):
-            step, _ = gauss_newton_step(self.normal_equations(linear, weights, noise))
-            values, linear, _ = self._descend(values, linear, step, noise, cost)
             equations = self.normal_equations(linear, weights, noise)
-            before, noise = noise, self.estimate_noise(linear, weights, noise, equations)
+            covariance, _ = pseudo_inverse(equations.hessian)
+            step = covariance @ equations.gradient
+            values, linear, _ = self._descend(values, linear, step, noise, cost)
+            freedom = {name: float(np.sum(covariance * part)) for name, part in equations.parts.items()}
+            before, noise = noise, self.estimate_noise(linear, weights, noise, freedom)
             weights, cost = self.mixture(linear, noise)
             change = max((abs(noise[n] / before[n] - 1.0) for n in self.unknown), default=0.0)
             if float(step @ equations.hessian @ step) < _SETTLED and change < _EVEN:
@@ -217,7 +218,7 @@ class CalibrationProblem:
                 "Check the names of joints and frames, the units, and that states and observations belong "
                 "together."
             )
-        values, linear = self._hold_untold(values, linear, weights, noise)
+        values, linear = self._hold_untold(values, linear, weights, noise, present)
         hessian = self.normal_equations(linear, weights, noise).hessian
         return CalibrationFit(values, noise, weights, linear, hessian, pseudo_inverse(hessian)[1])
 
@@ -240,14 +241,15 @@ class CalibrationProblem:
         linear: list[Linearised],
         weights: Sequence[Array],
         noise: Mapping[str, float],
+        present: Array,
     ) -> tuple[Array, list[Linearised]]:
         """Return values that explain the data alike, without correction in untold directions."""
         for _ in range(_HALVINGS):
             equations = self.normal_equations(linear, weights, noise)
             step, told = gauss_newton_step(equations)
-            untold = values - told @ (told.T @ values)
+            untold = values - present - told @ (told.T @ (values - present))
             # Where a direction is curved, a step of the others follows.
-            if not len(untold) or max(float(np.abs(untold).max()), float(np.abs(step).max())) < FINEST:
+            if told.shape[1] == len(values) or np.abs([untold, step]).max() < FINEST:
                 break
             values = values + step - untold
             linear = self.linearise(values)
