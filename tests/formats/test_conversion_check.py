@@ -7,12 +7,11 @@ import re
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from round_trip import load_cached
 
 import kineverse as kv
-from kineverse.formats.engines import PoseEngine, rotation_angle
+from kineverse.formats.engines import PoseEngine
 from kineverse.model.registry import FrameDeviation
 
 for package in ("pinocchio", "mujoco", "pydrake"):
@@ -141,12 +140,6 @@ def test_a_missing_engine_is_told_with_what_installs_it(
     monkeypatch.setattr(importlib, "import_module", missing)
     with pytest.raises(kv.errors.MissingDependencyError, match=r"is not installed: .*\[check\]"):
         kv.formats.check_conversion(arm(), tmp_path / f"m.{ending}")
-
-
-def test_the_angle_between_rotations_is_exact_when_small() -> None:
-    for angle in (1e-12, 1e-6, 1.0, np.pi):
-        turn = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
-        assert float(rotation_angle(turn, np.eye(3))) == pytest.approx(angle, rel=1e-4)
 
 
 def test_an_engine_states_its_package() -> None:

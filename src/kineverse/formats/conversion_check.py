@@ -11,12 +11,13 @@ from msgspec import Struct
 
 from kineverse._checks import as_count
 from kineverse.errors import FormatError, InvalidValueError, list_some
+from kineverse.lie import rotation_angle
 from kineverse.model import registry
 from kineverse.model.model_view import ModelView
 from kineverse.model.registry import FrameDeviation
 from kineverse.model.sampling import StateSamples
 
-from .engines import PoseEngine, rotation_angle
+from .engines import PoseEngine
 from .export.link_tree import sort_parents_first
 
 EQUAL = 1e-9  # largest difference of a pose [m], [rad] that counts as rounding
@@ -106,7 +107,8 @@ def check_conversion(
     for state, expected in zip(values, poses, strict=True):
         found = engine.poses(state)[chosen]
         distance = np.maximum(distance, np.linalg.norm(found[:, :3, 3] - expected[:, :3, 3], axis=1))
-        angle = np.maximum(angle, rotation_angle(found[:, :3, :3], expected[:, :3, :3]))
+        turned = np.swapaxes(found[:, :3, :3], 1, 2) @ expected[:, :3, :3]
+        angle = np.maximum(angle, rotation_angle(turned))
     errors = {
         name: FrameDeviation(float(p), float(a)) for name, p, a in zip(names, distance, angle, strict=True)
     }

@@ -24,6 +24,7 @@ from kineverse._extras import install_command
 from kineverse.errors import FormatError, MissingDependencyError
 from kineverse.formats.poses import pose_from_quaternion
 from kineverse.formats.sdf.custom_attributes import FREE, HOME, LOOP, NAME, NAMESPACE, ZERO
+from kineverse.lie import rotation_angle
 from kineverse.model.registry import FrameDeviation
 
 Array = npt.NDArray[np.float64]
@@ -321,16 +322,12 @@ class DrakeEngine(PoseEngine):
         for joint in self._loops:
             ends = [joint.findtext(role, "") for role in ("parent", "child")]
             a, b = (np.eye(4) if end == "world" else self._pose(end) for end in ends)
-            angle = 0.0 if joint.get("type") == "ball" else rotation_angle(a[:3, :3], b[:3, :3])
+            turned = rotation_angle(a[:3, :3].T @ b[:3, :3])
+            angle = 0.0 if joint.get("type") == "ball" else float(turned)
             found[joint.get("name", "")] = FrameDeviation(
                 float(np.linalg.norm(a[:3, 3] - b[:3, 3])), float(angle)
             )
         return found
-
-
-def rotation_angle(a: Array, b: Array) -> Any:
-    """Return the angles between rotations (..., 3, 3) [rad], exact for small ones."""
-    return 2 * np.arcsin(np.minimum(np.linalg.norm(a - b, axis=(-2, -1)) / math.sqrt(8), 1.0))
 
 
 def _given(element: ElementTree.Element, key: str) -> str:
