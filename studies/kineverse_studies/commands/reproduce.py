@@ -67,6 +67,7 @@ def run(arguments: argparse.Namespace) -> int:
     options = Options(**{f.name: given[f.name] for f in fields(Options) if f.name in given})
     needed = REQUIRED_EXTRAS.get(arguments.name, ())
     extras = {
+        "check": "check" in needed,
         "control": "control" in needed,
         "exchange": "exchange" in needed,
         "figures": arguments.figure is not None,

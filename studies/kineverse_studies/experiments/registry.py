@@ -63,9 +63,11 @@ EXPERIMENTS: Mapping[str, str] = {
     "live": "three objects opened and closed by processes in real time, and kitchens (2022 paper, IV-D)",
     "ablations": "pushes and locks without augmented gradients, and with each rule of trends",
     "estimation-grid": "hinges and sliders learned from noisy poses, against the Cramér-Rao bound",
+    "conversion": "models written as URDF, MJCF and SDF, compared with pinocchio, MuJoCo and drake",
 }
 """Descriptions of experiments by name; the names are modules of this package, with dashes for underscores."""
 REQUIRED_EXTRAS: Mapping[str, tuple[str, ...]] = {  # extras without which an experiment cannot run
+    "conversion": ("check",),
     "ablations": ("control", "geometry"),
     "kitchens": ("control", "geometry"),
     "live": ("control", "geometry", "mjcf", "exchange"),
