@@ -32,6 +32,9 @@ listed on standard error; --strict refuses these, too, and --leave-out names exc
 back before it becomes OUT. It is written whole or not at all, and replaces a file only with --force. If OUT
 is a dash, a document goes to standard output.
 
+USD (.usda, .usdc, .usd) holds the document of the model beside joints for other tools, so nothing is
+refused unless --strict is given; needs the extra usd.
+
 Mesh files are not copied; OUT refers to them by paths that are valid from its folder. Meshes that MuJoCo
 cannot read are converted, into a folder beside OUT; missing ones are left out of MJCF.
 
@@ -43,6 +46,7 @@ examples:
   kineverse convert live:home home.kv.json
   kineverse convert kitchen - | gzip > kitchen.kv.json.gz
   kineverse convert pr2 pr2.xml
+  kineverse convert pr2 pr2.usda
   kineverse convert garage.kv.json garage.urdf --strict --leave-out garage/lock
   kineverse convert articulations/pedal_bin bin.xml --tolerance 0.01"""
 
