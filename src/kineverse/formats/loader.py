@@ -94,8 +94,8 @@ def load(
     Parameters
     ----------
     source
-        Path of a ``.urdf``, ``.sdf``, ``.xml`` (MJCF, or URDF), ``.xacro``, ``.kv.json`` or ``.kv.msgpack``
-        file, or a name such as ``kitchen``, ``pr2`` or ``articulations/screw``, see
+        Path of a ``.urdf``, ``.sdf``, ``.xml`` (MJCF, or URDF), ``.usda``, ``.xacro``, ``.kv.json`` or
+        ``.kv.msgpack`` file, or a name such as ``kitchen``, ``pr2`` or ``articulations/screw``, see
         :func:`kineverse.formats.locate.locate_model`. ``live:NAME`` is a model that other processes edit as
         well: the result follows it, and edits of the result are theirs.
     prefix

@@ -45,7 +45,7 @@ class UsdBodyReader:
         self._shapes: dict[str, list[tuple[Any, str]]] = {}
         self.remarks: list[str] = []
         self._meshes = 0
-        for prim in scene.stage.Traverse():
+        for prim in scene.stage.Traverse(pxr().Usd.TraverseInstanceProxies()):
             if prim.IsA(pxr().UsdGeom.Gprim):
                 self._shapes.setdefault(find_body_above(prim, scene.bodies), []).append(
                     (prim, str(prim.GetPath()))

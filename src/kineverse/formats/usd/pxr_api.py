@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -81,7 +82,7 @@ def open_stage(path: Path) -> Any:
         # A layer that is opened by its path may be an older one, which somebody in the process still holds.
         layer = api.Sdf.Layer.OpenAsAnonymous(str(path))
     except api.Tf.ErrorException as error:
-        raise FormatError(f"{path} is no USD that can be read: {_reason(error)}.") from None
+        raise FormatError(f"{path} is no USD that can be read: {_reason(error, path)}.") from None
     if layer is None:
         raise FormatError(f"{path} is no USD that can be read: its content is that of no USD file.")
     others = [name for name in layer.GetCompositionAssetDependencies() if name]
@@ -93,17 +94,18 @@ def open_stage(path: Path) -> Any:
     try:
         stage = api.Usd.Stage.Open(layer)
     except api.Tf.ErrorException as error:
-        raise FormatError(f"{path} is no USD that can be read: {_reason(error)}.") from None
+        raise FormatError(f"{path} is no USD that can be read: {_reason(error, path)}.") from None
     if stage is None:
         raise FormatError(f"{path} is no USD that can be read: it has no stage.")
     return stage
 
 
-def _reason(error: Exception) -> str:
-    """Return the reason in an error of OpenUSD, without the places in its sources, on one line."""
-    text = str(error).strip()
+def _reason(error: Exception, path: Path) -> str:
+    """Return the reason in an error of OpenUSD on one line, without the file and places in its sources."""
+    text, file = str(error).strip(), os.path.abspath(path)
     found = _REASON.search(text)
-    return " ".join((found[1] if found else text).split()).removesuffix(".")[:_LONGEST_REASON]
+    reason = (found[1] if found else text).replace(f"<{file}>", "it").replace(f"{file}:", "line ")
+    return " ".join(reason.split()).removesuffix(".")[:_LONGEST_REASON]
 
 
 def to_gf_matrix(pose: Matrix) -> Any:
