@@ -62,6 +62,7 @@ EXPERIMENTS: Mapping[str, str] = {
     "lockbox": "parts that lock each other, opened by trends and by plans (thesis behind the 2020 paper)",
     "live": "three objects opened and closed by processes in real time, and kitchens (2022 paper, IV-D)",
     "ablations": "pushes and locks without augmented gradients, and with each rule of trends",
+    "calibration": "joints, cameras and wheels calibrated, against the Cramér-Rao bound and OpenCV",
     "estimation-grid": "hinges and sliders learned from noisy poses, against the Cramér-Rao bound",
     "conversion": "models written as URDF, MJCF and SDF, compared with pinocchio, MuJoCo and drake",
 }
