@@ -9,7 +9,7 @@ from kineverse.model.model_view import ModelView
 from kineverse.symbols import Symbol
 
 from .body_checks import check_bodies
-from .joint_checks import check_axis, check_limits, check_moved_bodies, check_scale
+from .joint_checks import check_axis, check_limits, check_moved_bodies, check_plane, check_scale
 from .moving_parts import MovingPart, MovingParts
 from .report import CoordinateReport, MotionFinding, MotionReport
 from .rigid_groups import RigidGroup
@@ -51,7 +51,10 @@ def _check_part(part: MovingPart) -> Iterator[MotionFinding]:
     axis = list(check_axis(part))
     yield from axis
     if not limits and not axis:
-        yield from check_sweep(part)
+        swept = list(check_sweep(part))
+        yield from swept
+        if not any(entry.severity == "suspect" for entry in swept):
+            yield from check_plane(part)
 
 
 def _check_bodies(parts: MovingParts, group: RigidGroup) -> Iterator[MotionFinding]:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 
+import numpy as np
+
 from kineverse.errors import list_some
 from kineverse.expressions.printing import format_number
 
@@ -45,6 +47,13 @@ AXIS_GAP = 0.25
 
 The axis of a hinge between thin boards may lie beside both.
 """
+
+FLAT = 3.0
+"""Ratio of sizes: of a plate, the second one is so many times the least, and the largest at most so many times the second."""
+
+NORMAL = math.radians(25.0)  # angle from the normal of a plate within which an axis is along it [rad]
+
+OFF_CENTER = 0.25  # distance of an axis from the middle of a plate that turns in its plane, in its largest size
 
 SCALE = 20.0
 """Size of a part, in sizes of all others together, from which on its scale is wrong; 1000 for millimetres."""
@@ -124,6 +133,26 @@ def check_axis(part: MovingPart) -> Iterator[MotionFinding]:
         yield _finding(part, "axis_outside", text, severity, value=min(gaps), limit=most, unit="m")
 
 
+def check_plane(part: MovingPart) -> Iterator[MotionFinding]:
+    """Yield a suspect for a flat part that turns in its own plane about a point at its edge.
+
+    A door or a lid turns out of its plane. Wheels and knobs turn in theirs, about their middle.
+    """
+    axis = part.fixed_axis
+    if axis is None or not axis.turn or part.is_robot_link or len(part.shape.points) < 3:
+        return
+    directions, extents = part.shape.principal_extents
+    longest, middle, least = extents.tolist()
+    beside = float(np.linalg.norm(np.cross(axis.direction, part.shape.middle - axis.point)))
+    is_plate = middle > FLAT * least and middle > longest / FLAT
+    tilt = math.acos(min(1.0, abs(float(directions[2] @ axis.direction))))
+    if is_plate and tilt < NORMAL and beside > OFF_CENTER * longest:
+        text = f"is flat, and turns in its own plane about a point {format_length(beside)} from its middle"
+        yield _finding(
+            part, "turned_axis", text, "suspect", value=beside, limit=OFF_CENTER * longest, unit="m"
+        )
+
+
 def check_moved_bodies(part: MovingPart) -> Iterator[MotionFinding]:
     """Yield a finding if a joint moves no shapes at all, and what cannot be said without shapes."""
     model = part.parts.model
@@ -132,6 +161,8 @@ def check_moved_bodies(part: MovingPart) -> Iterator[MotionFinding]:
         if not part.parts.solid_bodies and not part.parts.unusable:
             yield _finding(part, "no_shapes", "the model has no shapes", "cannot_say")
             return
+        if not part.group.is_child:
+            return  # a further frame of a mechanism, such as the end of an arm
         what = f"only the mass of {list_some(map(repr, carried), 3)}" if carried else "nothing"
         severity: Severity = "suspect" if carried or part.is_robot_link else "finding"
         yield _finding(part, "moves_nothing", f"moves {what}: no shape hangs on it", severity)

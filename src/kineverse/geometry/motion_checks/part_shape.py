@@ -50,11 +50,18 @@ class PartShape:
             return None
 
     @cached_property
-    def thickness(self) -> float:
-        """Extent along the axis on which the points are closest together [m]."""
+    def principal_extents(self) -> tuple[Floats, Floats]:
+        """Principal axes of the points as rows (3, 3), and the extents along them (3,) [m], the largest first."""
         centred = self.points - self.points.mean(axis=0)
-        axes = np.linalg.svd(centred, full_matrices=False)[2]
-        return float(np.ptp(centred @ axes[-1])) if len(axes) == 3 else 0.0
+        axes = np.linalg.svd(centred.T @ centred)[2]
+        extents = np.ptp(centred @ axes.T, axis=0)
+        order = np.argsort(-extents)
+        return axes[order], extents[order]
+
+    @property
+    def thickness(self) -> float:
+        """Least of the principal extents [m]."""
+        return float(self.principal_extents[1][2])
 
     def distance_to(self, point: Floats) -> float:
         """Return the distance of a point (3,) from the hull, at least [m]; 0 inside."""

@@ -37,7 +37,8 @@ class RigidGroup:
     carrier: int  # number of the group that carries it; -1 for the group at rest
     coordinates: tuple[Symbol, ...]  # those that move it in its carrier
     bodies: tuple[str, ...]  # frames of it with shapes or inertia
-    joint: str  # name of the articulation that moves it; that of the frame without one
+    joint: str  # name of the articulation whose child it is; that of the frame without one
+    is_child: bool  # True for the child of an articulation, False for another frame that it writes
 
 
 @dataclass(frozen=True)
@@ -86,7 +87,14 @@ class RigidGroups(Sequence[RigidGroup]):
         bodies = {name for name, body in model.bodies.items() if not is_empty_body(body)}
         self._groups = [
             RigidGroup(
-                k, frame, parent, carrier, by, tuple(f for f in members[k] if f in bodies), joints.get(frame, frame)
+                number=k,
+                frame=frame,
+                parent=parent,
+                carrier=carrier,
+                coordinates=by,
+                bodies=tuple(f for f in members[k] if f in bodies),
+                joint=joints.get(frame, frame),
+                is_child=frame in joints,
             )
             for k, (frame, parent, carrier, by) in enumerate(heads)
         ]
