@@ -50,7 +50,7 @@ def _check_part(part: MovingPart) -> Iterator[MotionFinding]:
         return
     axis = list(check_axis(part))
     yield from axis
-    if not limits and not axis:
+    if not any(entry.severity == "finding" for entry in (*limits, *axis)):
         swept = list(check_sweep(part))
         yield from swept
         if not any(entry.severity == "suspect" for entry in swept):

@@ -36,7 +36,7 @@ The angle of a door, 1.57 rad, is 1.57°.
 LEAST_TRAVEL, LEAST_SHARE = 1e-3, 0.01
 """Range of a slider that is too small [m], if it is also below this share of the part."""
 
-MOST_TRAVEL = 50.0
+MOST_TRAVEL = 25.0
 """Range of a slider that is too large, in sizes of the part, if it is also twice the size of everything.
 
 Metres that are given as millimetres are a thousand times as many; a lift travels ten times its height.
@@ -58,7 +58,8 @@ OFF_CENTER = 0.25  # distance of an axis from the middle of a plate that turns i
 SCALE = 20.0
 """Size of a part, in sizes of all others together, from which on its scale is wrong; 1000 for millimetres."""
 
-SMALLEST_PART = 1e-3  # size below which the scale of a part is wrong [m]; 0.001 of a metre
+SMALLEST_PART, LARGEST_PART = 1e-3, 20.0
+"""Least and largest size of a part that moves [m]: that of a grain, and of a house."""
 
 
 def check_limits(part: MovingPart) -> Iterator[MotionFinding]:
@@ -174,20 +175,21 @@ def check_moved_bodies(part: MovingPart) -> Iterator[MotionFinding]:
 
 
 def check_scale(parts: MovingParts, bodies: Sequence[str], joint: str = "") -> Iterator[MotionFinding]:
-    """Yield a suspect for bodies that are far larger than all others, or too small to be seen."""
-    size = parts.shape_of(bodies).size
-    rest = parts.shape_of([body for body in parts.scene.bodies if body not in set(bodies)]).size
-    if parts.is_normalized or not size:
+    """Yield a suspect for the bodies of a part that are far too large, or too small to be seen."""
+    if parts.is_normalized or not bodies:
         return
-    if rest and size > SCALE * rest:
-        text = f"is {format_length(size)} large, and all others together {format_length(rest)}"
-        value, limit, unit = size, SCALE * rest, "m"
-    elif size < SMALLEST_PART:
-        text = f"is {format_length(size)} large"
-        value, limit, unit = size, SMALLEST_PART, "m"
+    rest = parts.shape_of([body for body in parts.scene.bodies if body not in set(bodies)]).size
+    most = min(LARGEST_PART, SCALE * rest or LARGEST_PART)
+    sizes = {body: parts.body_shape(body).size for body in bodies}
+    largest, smallest = max(bodies, key=sizes.__getitem__), min(bodies, key=sizes.__getitem__)
+    if sizes[largest] > most:
+        body, limit, others = largest, most, f", and all others together {format_length(rest)}" if rest else ""
+    elif sizes[smallest] < SMALLEST_PART:
+        body, limit, others = smallest, SMALLEST_PART, ""
     else:
         return
-    yield MotionFinding("wrong_scale", "suspect", text, tuple(bodies), joint, value, limit, unit)
+    text = f"'{body}' is {format_length(sizes[body])} large{others}"
+    yield MotionFinding("wrong_scale", "suspect", text, (body,), joint, sizes[body], limit, "m")
 
 
 def _finding(

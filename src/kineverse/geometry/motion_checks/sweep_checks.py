@@ -30,19 +30,20 @@ SMALL_GAP = 0.02  # distance up to which a part of any size is held [m]: rails a
 GAP, LEAST_GAP = 0.15, 0.01
 """Distance of a part from all others that is a suspect, in sizes of the part, and at least [m]."""
 
-TOUCHING = 1e-3  # depth of an overlap at rest up to which two bodies only touch [m]
-
 ENTERED, LEAST_ENTERED = 0.02, 3e-3
 """Depth that is a suspect if two bodies do not overlap at rest, in sizes of the part, and at least [m].
 
 The edge of a door turns into its frame by a part of its thickness.
 """
 
-DEEPER, LEAST_DEEPER = 0.15, 0.01
-"""Further depth that is a suspect if they overlap at rest, in sizes of the part, and at least [m].
+BEFORE = 4.0
+"""Further depth that is accepted, in depths at rest.
 
-The overlap says that hulls and boxes stand for more than there is, such as a bearing.
+Shapes that overlap at rest are coarse, or one slides in the other, as a bolt does.
 """
+
+DEEPER, LEAST_DEEPER = 0.15, 0.01
+"""Further depth that is a suspect whatever the depth at rest, in sizes of the part, and at least [m]."""
 
 _EVERYTHING = Rule("*", "*", True)
 
@@ -157,6 +158,7 @@ class Sweep:
         """Return True if the surfaces of meshes overlap too, whose hulls do.
 
         A cabinet is hollow, and its hull is not. The depth of surfaces is less exact, so hulls have to agree.
+        Surfaces that are deep in each other at rest are badly drawn, and then only the hulls count.
         """
         parts = self.part.parts
         shapes = [s for name in overlap.bodies for s in collision_shapes(parts.model.bodies[name])]
@@ -166,14 +168,14 @@ class Sweep:
         for state in (parts.default, overlap.state):
             parts.surfaces.update(state)
             depths.append(max(0.0, -parts.surfaces.distance(*overlap.bodies).distance))
-        return depths[1] - depths[0] > accepted_depth(0.0, self.part.size)
+        size = self.part.size
+        return depths[0] > DEEPER * size or depths[1] - depths[0] > accepted_depth(0.0, size)
 
 
 def accepted_depth(before: float, size: float) -> float:
     """Return the further depth that is accepted for a part of a size, after a depth at rest [m]."""
-    if before <= TOUCHING:
-        return max(ENTERED * size, LEAST_ENTERED)
-    return max(DEEPER * size, LEAST_DEEPER)
+    least = max(ENTERED * size, LEAST_ENTERED)
+    return max(least, min(least + BEFORE * before, max(DEEPER * size, LEAST_DEEPER)))
 
 
 def check_sweep(part: MovingPart) -> Iterator[MotionFinding]:

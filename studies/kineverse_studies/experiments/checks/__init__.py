@@ -92,11 +92,15 @@ def break_models(
     seed: int, joints: dict[str, tuple[SoundJoint, ...]], sound: dict[str, MotionReport]
 ) -> list[BrokenModel]:
     """Return what is found in one broken model for each break."""
+    silent = {
+        name: {one.name for one in report.coordinates if not one.findings and not one.suspects}
+        for name, report in sound.items()
+    }
     result = []
     for number, break_ in enumerate(BREAKS):
         rng = np.random.default_rng([seed, number])
         fitting = {
-            name: [one for one in some if break_.applies(one) and sound[name][one.coordinate].ok]
+            name: [one for one in some if break_.applies(one) and one.coordinate in silent[name]]
             for name, some in joints.items()
         }
         names = [name for name, some in fitting.items() if some]
