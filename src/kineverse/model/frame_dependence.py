@@ -86,9 +86,7 @@ def moved_frames(model: ModelView, symbols: Iterable[Symbol | str]) -> dict[Symb
     return result
 
 
-def moving_symbols(
-    model: ModelView, symbols: Iterable[Symbol | str]
-) -> dict[str, tuple[Symbol, ...]]:
+def moving_symbols(model: ModelView, symbols: Iterable[Symbol | str]) -> dict[str, tuple[Symbol, ...]]:
     """Return which of some symbols move each frame in its parent, for the frames that any of them moves.
 
     The symbols are compared as in :class:`FrameDependence`. The frames are in the order of the model.

@@ -18,6 +18,7 @@ from kineverse.errors import suggest
 from kineverse.formats.description import DisjointSets
 from kineverse.formats.mimic import MimicRelation, is_valid_factor
 from kineverse.formats.poses import rotate_direction
+from kineverse.formats.reader_warnings import CrossedLimits
 from kineverse.formats.xml_reader import Element, ElementError, find_child, quote
 from kineverse.formats.xml_values import (
     read_axis_direction,
@@ -123,7 +124,8 @@ def _axis(node: PoseNode, tag: str, suffix: str, kind: SdfJointType) -> SdfAxis:
         mistake = ElementError(
             limit, f"has lower {lower!r} above upper {upper!r}: no position would be valid."
         )
-        remarks.repair(mistake, "the joint is not limited", element)
+        crossed = partial(CrossedLimits.of, f"{node.path}{suffix}")
+        remarks.repair(mistake, "the joint is not limited", element, crossed)
         lower = upper = None
     values = [] if effort is None or effort < 0.0 else [("effort", effort)]
     if dynamics is not None:

@@ -2,28 +2,57 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 
+from kineverse.formats.reader_warnings import CrossedLimits
 from kineverse.geometry.shapes import import_coal
 from kineverse.model.model_view import ModelView
 from kineverse.symbols import Symbol
 
 from .body_checks import check_bodies
-from .joint_checks import check_axis, check_limits, check_moved_bodies, check_plane, check_scale
+from .joint_checks import check_joint_axis, check_joint_limits, check_moved_bodies, check_plane, check_scale
 from .moving_parts import MovingPart, MovingParts
 from .report import CoordinateReport, MotionFinding, MotionReport
 from .rigid_groups import RigidGroup
 from .sweep_checks import check_sweep
 
 
-def check_motion(model: ModelView) -> MotionReport:
+def check_motion(model: ModelView, faults: Iterable[str] = ()) -> MotionReport:
+    """Check what each coordinate of a model moves, over its whole range, and the bodies that it moves.
+
+    Rigid groups are looked at, the frames that a coordinate moves as one, with all other coordinates at the
+    default state. Only pairs of bodies that the coordinates of one joint move count: that two doors open into
+    each other is no mistake. ``docs/checks.md`` says what is certain, and why.
+
+    Parameters
+    ----------
+    model
+        A model or a snapshot of one.
+    faults
+        Warnings of its reader, see :func:`kineverse.formats.collect_warnings`: limits that are crossed in the
+        file are not in the model any more.
+
+    Returns
+    -------
+    MotionReport
+        Findings, which are certainly wrong; suspects, which are worth a look; and what could not be checked.
+
+    Raises
+    ------
+    MissingDependencyError
+        If coal is not installed.
+    """
     import_coal()
     parts = MovingParts(model)
+    crossed = {fault.joint: str(fault) for fault in faults if isinstance(fault, CrossedLimits)}
     seen: set[int] = {0}
     reports = []
     for coordinate in model.degrees_of_freedom:
-        entries = tuple(_check_coordinate(parts, coordinate, seen))
-        reports.append(CoordinateReport(str(coordinate), entries))
+        name = str(coordinate)
+        entries = list(_check_coordinate(parts, coordinate, seen))
+        if name in crossed:
+            entries.insert(0, MotionFinding("crossed_limits", "finding", crossed[name], joint=name))
+        reports.append(CoordinateReport(name, tuple(entries)))
     has_robot = any(parts.is_robot_link(group) for group in list(parts.groups)[1:])
     rest = tuple(check_bodies(parts, parts.groups[0].bodies, not has_robot))
     return MotionReport(tuple(reports), CoordinateReport("", rest))
@@ -44,11 +73,11 @@ def _check_coordinate(parts: MovingParts, coordinate: Symbol, seen: set[int]) ->
 
 def _check_part(part: MovingPart) -> Iterator[MotionFinding]:
     yield from check_moved_bodies(part)
-    limits = list(check_limits(part))
+    limits = list(check_joint_limits(part))
     yield from limits
     if part.axis is None or not part.solids:
         return
-    axis = list(check_axis(part))
+    axis = list(check_joint_axis(part))
     yield from axis
     if not any(entry.severity == "finding" for entry in (*limits, *axis)):
         swept = list(check_sweep(part))

@@ -22,7 +22,7 @@ Wrists of robots have up to two turns. As radians, the least range in degrees th
 LARGEST_ANGLE = 720.0  # largest range of a hinge in degrees, as from -360° to 360°; above, there is no limit
 
 SYMMETRIC = 40.0
-"""Range from -x to x of a hinge up to which x may be a number that stands for no limit, as 10 rad do [rad]."""
+"""Range from -x to x of a hinge up to which x may stand for no limit, as 10 rad do [rad]."""
 
 WHOLE_TURNS = 0.035
 """Largest difference of a range from whole turns, as valves and screws have [rad]: 2°, for π as 3.14."""
@@ -49,11 +49,13 @@ The axis of a hinge between thin boards may lie beside both.
 """
 
 FLAT = 3.0
-"""Ratio of sizes: of a plate, the second one is so many times the least, and the largest at most so many times the second."""
+"""Ratios of sizes of a plate: at least of the second to the least, at most of the largest to the second."""
 
 NORMAL = math.radians(25.0)  # angle from the normal of a plate within which an axis is along it [rad]
 
-OFF_CENTER = 0.25  # distance of an axis from the middle of a plate that turns in its plane, in its largest size
+OFF_CENTER = (
+    0.25  # distance of an axis from the middle of a plate that turns in its plane, in its largest size
+)
 
 SCALE = 20.0
 """Size of a part, in sizes of all others together, from which on its scale is wrong; 1000 for millimetres."""
@@ -62,14 +64,16 @@ SMALLEST_PART, LARGEST_PART = 1e-3, 20.0
 """Least and largest size of a part that moves [m]: that of a grain, and of a house."""
 
 
-def check_limits(part: MovingPart) -> Iterator[MotionFinding]:
+def check_joint_limits(part: MovingPart) -> Iterator[MotionFinding]:
     """Yield what is wrong about the limits of a coordinate."""
     lower, upper = part.limits
     extent = upper - lower
     if lower > upper:
         shown = format_number(lower), format_number(upper)
         text = f"no value is within the limits: the lower one is {shown[0]}, the upper one {shown[1]}"
-        yield _finding(part, "crossed_limits", text, value=-extent, limit=0.0, unit="rad" if part.turns else "m")
+        yield _finding(
+            part, "crossed_limits", text, value=-extent, limit=0.0, unit="rad" if part.turns else "m"
+        )
         return
     if not math.isfinite(extent) or extent == 0.0:
         return
@@ -83,18 +87,21 @@ def _check_angles(part: MovingPart, extent: float) -> Iterator[MotionFinding]:
     axis = part.axis
     assert axis is not None
     angle = extent * axis.turn  # of the part, which may be geared
-    drives_slider = axis.shift != 0.0 and abs(axis.shift) > 1e-9 or _shifts_another(part)
+    drives_slider = (axis.shift != 0.0 and abs(axis.shift) > 1e-9) or _shifts_another(part)
     turns = angle / math.tau
     is_whole = abs(angle - math.tau * round(turns)) < WHOLE_TURNS
-    if MOST_TURNS < turns and angle <= LARGEST_ANGLE and not is_whole and not drives_slider:
-        text = f"turns {format_number(turns, 3)} times; as degrees, the range {format_number(extent, 4)} is usual"
+    if turns > MOST_TURNS and angle <= LARGEST_ANGLE and not is_whole and not drives_slider:
+        shown = format_number(turns, 3), format_number(extent)
+        text = f"turns {shown[0]} times; as degrees, a range of {shown[1]} is usual"
         is_open = sum(part.limits) == 0.0 and angle <= SYMMETRIC
         severity: Severity = "suspect" if is_open else "finding"
         limit = MOST_TURNS * math.tau
         yield _finding(part, "degrees_for_radians", text, severity, value=angle, limit=limit, unit="rad")
     elif angle < LEAST_ANGLE:
         text = f"turns by {format_number(math.degrees(angle), 3)}° only"
-        yield _finding(part, "radians_for_degrees", text, "suspect", value=angle, limit=LEAST_ANGLE, unit="rad")
+        yield _finding(
+            part, "radians_for_degrees", text, "suspect", value=angle, limit=LEAST_ANGLE, unit="rad"
+        )
 
 
 def _shifts_another(part: MovingPart) -> bool:
@@ -117,8 +124,8 @@ def _check_lengths(part: MovingPart, extent: float) -> Iterator[MotionFinding]:
         yield _finding(part, "millimetres_for_metres", text, value=travel, limit=most, unit="m")
 
 
-def check_axis(part: MovingPart) -> Iterator[MotionFinding]:
-    """Yield a finding for the axis of a hinge that passes neither through the part nor near what carries it."""
+def check_joint_axis(part: MovingPart) -> Iterator[MotionFinding]:
+    """Yield a finding for the axis of a hinge that is near neither the part nor anything else."""
     axis = part.fixed_axis
     if axis is None or not axis.turn or not part.solids:
         return
@@ -130,7 +137,9 @@ def check_axis(part: MovingPart) -> Iterator[MotionFinding]:
     gaps += [part.parts.shape_of([b]).distance_to_line(axis.point, axis.direction) for b in others]
     if min(gaps) > most:
         text = f"turns about an axis that is {format_length(min(gaps))} away from it and from all else"
-        severity: Severity = "suspect" if part.is_robot_link or not part.parts.solids(part.carrier) else "finding"
+        severity: Severity = (
+            "suspect" if part.is_robot_link or not part.parts.solids(part.carrier) else "finding"
+        )
         yield _finding(part, "axis_outside", text, severity, value=min(gaps), limit=most, unit="m")
 
 
@@ -183,7 +192,11 @@ def check_scale(parts: MovingParts, bodies: Sequence[str], joint: str = "") -> I
     sizes = {body: parts.body_shape(body).size for body in bodies}
     largest, smallest = max(bodies, key=sizes.__getitem__), min(bodies, key=sizes.__getitem__)
     if sizes[largest] > most:
-        body, limit, others = largest, most, f", and all others together {format_length(rest)}" if rest else ""
+        body, limit, others = (
+            largest,
+            most,
+            f", and all others together {format_length(rest)}" if rest else "",
+        )
     elif sizes[smallest] < SMALLEST_PART:
         body, limit, others = smallest, SMALLEST_PART, ""
     else:

@@ -10,6 +10,7 @@ from functools import cached_property
 import numpy as np
 
 from kineverse.errors import FormatError, InvalidValueError, NoSolutionError
+from kineverse.formats.partnet.description import NORMALIZED
 from kineverse.geometry.exclusions import find_unusable_shapes
 from kineverse.geometry.mesh_files import Floats
 from kineverse.geometry.objects import collision_shapes
@@ -24,23 +25,14 @@ from .rigid_groups import SAME_AXIS, Axis, RigidGroup, RigidGroups
 STATES = 25  # states in which a coordinate is looked at: steps of 4° for a door, of 2 cm for a drawer
 
 ROBOT_CHAIN = 3
-"""Number of moving parts in a row from which on they are links of a robot: furniture has a door and its handle.
+"""Least number of moving parts in a row that are links of a robot; furniture has a door and its handle.
 
 Robots have empty links, and shapes that stand for half of a link, so less is certain about them.
 """
 
-NORMALIZED = "geometry/normalized"
-"""Name of the data entry of models whose lengths are not metres, as those of PartNet; below a prefix if one is given."""
-
 
 class MovingParts:
-    """Rigid groups of a model with their shapes, and its scene.
-
-    Parameters
-    ----------
-    model
-        The model.
-    """
+    """Rigid groups of a model with their shapes, and its scene."""
 
     def __init__(self, model: ModelView) -> None:
         self.model = model

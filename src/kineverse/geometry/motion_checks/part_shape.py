@@ -10,7 +10,6 @@ import numpy as np
 
 from kineverse.errors import InvalidValueError
 from kineverse.geometry.decomposition.accuracy import Polytope
-from kineverse.geometry.gjk import support_values
 from kineverse.geometry.mesh_files import Faces, Floats
 from kineverse.geometry.shapes import Solid, solid_from_geometry
 from kineverse.lie import rotation_along_z
@@ -20,13 +19,7 @@ DIRECTIONS = 180  # directions in which a line is looked at from a part: a step 
 
 
 class PartShape:
-    """Points whose convex hull is that of some placed shapes.
-
-    Parameters
-    ----------
-    points
-        (n, 3) points in one frame [m].
-    """
+    """Points whose convex hull is that of some placed shapes."""
 
     def __init__(self, points: Floats) -> None:
         self.points = points
@@ -51,7 +44,7 @@ class PartShape:
 
     @cached_property
     def principal_extents(self) -> tuple[Floats, Floats]:
-        """Principal axes of the points as rows (3, 3), and the extents along them (3,) [m], the largest first."""
+        """Principal axes of the points as rows (3, 3), and the extents along them (3,), largest first [m]."""
         centred = self.points - self.points.mean(axis=0)
         axes = np.linalg.svd(centred.T @ centred)[2]
         extents = np.ptp(centred @ axes.T, axis=0)

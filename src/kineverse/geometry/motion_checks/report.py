@@ -51,7 +51,9 @@ class MotionFinding:
     text
         The reason in one line.
     bodies
-        The bodies that it is about; the moving part first.
+        The bodies that it is about: those of the moving part.
+    against
+        The body that they enter; empty for none.
     joint
         Name of the articulation; empty for a body.
     value, limit, unit
@@ -69,10 +71,11 @@ class MotionFinding:
     limit: float | None = None
     unit: str = ""
     state: Mapping[str, float] = field(default_factory=dict)
+    against: str = ""
 
     @property
     def advice(self) -> str:
-        """What to do."""
+        """Advice for the kind."""
         return ADVICE[self.kind]
 
     def to_json(self) -> dict[str, Any]:
@@ -83,6 +86,7 @@ class MotionFinding:
             "advice": self.advice,
             "joint": self.joint or None,
             "bodies": list(self.bodies),
+            "against": self.against or None,
             "value": self.value,
             "limit": self.limit,
             "unit": self.unit or None,
@@ -92,7 +96,7 @@ class MotionFinding:
 
 @dataclass(frozen=True)
 class CoordinateReport:
-    """What the checks say of one coordinate and the parts that it moves.
+    """Report of one coordinate and the parts that it moves.
 
     Attributes
     ----------
@@ -110,17 +114,17 @@ class CoordinateReport:
 
     @property
     def findings(self) -> tuple[MotionFinding, ...]:
-        """What is certainly wrong."""
+        """Entries that are certainly wrong."""
         return self._of("finding")
 
     @property
     def suspects(self) -> tuple[MotionFinding, ...]:
-        """What is worth a look."""
+        """Entries that are worth a look."""
         return self._of("suspect")
 
     @property
     def cannot_say(self) -> tuple[MotionFinding, ...]:
-        """What could not be checked, and why."""
+        """Entries about what could not be checked, and why."""
         return self._of("cannot_say")
 
     @property

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -43,7 +44,7 @@ class RigidGroup:
 
 @dataclass(frozen=True)
 class Axis:
-    """Screw motion by a coordinate, in the frame of the carrier: p ↦ turn · direction × (p - point) + shift."""
+    """Velocity of points p by a coordinate: turn · direction × (p - point) + shift · direction."""
 
     direction: Floats  # (3,) unit vector; of a motion without a turn, that of the shift
     point: Floats  # (3,) a point of the axis [m]
@@ -52,13 +53,7 @@ class Axis:
 
 
 class RigidGroups(Sequence[RigidGroup]):
-    """All rigid groups of a model, carriers first; number 0 is the group at rest.
-
-    Parameters
-    ----------
-    model
-        The model.
-    """
+    """All rigid groups of a model, carriers first; number 0 is the group at rest."""
 
     def __init__(self, model: ModelView) -> None:
         self.model = model
@@ -99,7 +94,7 @@ class RigidGroups(Sequence[RigidGroup]):
             for k, (frame, parent, carrier, by) in enumerate(heads)
         ]
         poses = [model.fk(group.frame, self._groups[group.carrier].frame) for group in self._groups[1:]]
-        self._poses = compile_expressions(poses, tier="interpreter") if poses else None
+        self._poses: Any = compile_expressions(poses, tier="interpreter") if poses else None
 
     def __len__(self) -> int:
         return len(self._groups)
@@ -148,7 +143,9 @@ class RigidGroups(Sequence[RigidGroup]):
                 return None
             return Axis(velocity / length, middle, 0.0, length)
         direction = unit_vector(turn)
-        return Axis(direction, middle + np.cross(turn, velocity) / speed**2, speed, float(direction @ velocity))
+        return Axis(
+            direction, middle + np.cross(turn, velocity) / speed**2, speed, float(direction @ velocity)
+        )
 
     def pose(self, group: RigidGroup, state: State) -> Floats:
         """Return the pose of a group in its carrier at a state, (4, 4) [m]."""

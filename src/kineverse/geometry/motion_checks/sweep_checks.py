@@ -1,10 +1,11 @@
-"""Checks of a part over the range of its coordinate: does it float, come apart, or enter what carries it?"""
+"""Checks of a part over the range of its coordinate: parts that float, come apart, or enter others."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -25,7 +26,9 @@ from .moving_parts import STATES, MovingPart
 from .report import MotionFinding, Severity, format_length
 
 AWAY = 0.25  # distance from all others, in sizes of the part, at which it floats or has come apart
-SMALL_GAP = 0.02  # distance up to which a part of any size is held [m]: rails and bearings often have no shape
+SMALL_GAP = (
+    0.02  # distance up to which a part of any size is held [m]: rails and bearings often have no shape
+)
 
 GAP, LEAST_GAP = 0.15, 0.01
 """Distance of a part from all others that is a suspect, in sizes of the part, and at least [m]."""
@@ -49,7 +52,7 @@ _EVERYTHING = Rule("*", "*", True)
 
 
 @dataclass(frozen=True)
-class Overlap:
+class SweptOverlap:
     """Overlap of two bodies that is deeper than at rest."""
 
     bodies: tuple[str, str]
@@ -64,13 +67,7 @@ class Overlap:
 
 
 class Sweep:
-    """Distances of a part from all that it does not carry, at the default state and over its range.
-
-    Parameters
-    ----------
-    part
-        Part with shapes.
-    """
+    """Distances of a part from all that it does not carry, at the default state and over its range."""
 
     def __init__(self, part: MovingPart) -> None:
         self.part = part
@@ -116,18 +113,20 @@ class Sweep:
         return not self._rests and not any(distances for _, distances in self._moved)
 
     def loose_state(self) -> State | None:
-        """Return the state furthest from rest in which nothing near at rest is within reach; None if there is none."""
+        """Return the state furthest from rest in which all that is near at rest is out of reach, if any."""
         home = self.part.home
         loose = [state for state, distances in self._moved if not self._rests.keys() & distances.keys()]
-        return max(loose, key=lambda s: abs(s[self.part.coordinate] - home)) if loose and self._rests else None
+        return (
+            max(loose, key=lambda s: abs(s[self.part.coordinate] - home)) if loose and self._rests else None
+        )
 
-    def overlaps(self, mirrored: bool = False) -> list[Overlap]:
+    def overlaps(self, mirrored: bool = False) -> list[SweptOverlap]:
         """Return the deepest overlap of each pair of bodies that only this joint moves, the worst first."""
         moved = self._moved
         if mirrored:
             looks = ((state, self._look(state)) for state in self.part.states(mirrored=True))
             moved = [(state, distances) for state, distances in looks if distances is not None]
-        worst: dict[tuple[str, str], Overlap] = {}
+        worst: dict[tuple[str, str], SweptOverlap] = {}
         for state, distances in moved:
             for pair, distance in distances.items():
                 if distance >= 0.0 or pair[1] not in self._own_pairs:
@@ -137,10 +136,10 @@ class Sweep:
                     worst[pair] = found
         return sorted(worst.values(), key=lambda overlap: -overlap.excess)
 
-    def _overlap(self, pair: tuple[str, str], depth: float, state: State) -> Overlap | None:
+    def _overlap(self, pair: tuple[str, str], depth: float, state: State) -> SweptOverlap | None:
         before, size = max(0.0, -self._rests.get(pair, 0.0)), self.part.size
         limit = accepted_depth(before, size)
-        return Overlap(pair, depth - before, limit, state) if depth - before > limit else None
+        return SweptOverlap(pair, depth - before, limit, state) if depth - before > limit else None
 
     @cached_property
     def _own_pairs(self) -> set[str]:
@@ -154,7 +153,7 @@ class Sweep:
             for body in other.bodies
         }
 
-    def is_confirmed(self, overlap: Overlap) -> bool:
+    def is_confirmed(self, overlap: SweptOverlap) -> bool:
         """Return True if the surfaces of meshes overlap too, whose hulls do.
 
         A cabinet is hollow, and its hull is not. The depth of surfaces is less exact, so hulls have to agree.
@@ -208,7 +207,9 @@ def _floating(part: MovingPart, sweep: Sweep) -> Iterator[MotionFinding]:
     severity: Severity = "suspect" if part.is_robot_link else "finding"
     parts = part.parts
     parts.scene.update(parts.default)
-    distance = min(r.distance for b in part.solids for o in sweep.others for r in parts.scene.distances([(b, o)]))
+    distance = min(
+        r.distance for b in part.solids for o in sweep.others for r in parts.scene.distances([(b, o)])
+    )
     text = f"is {format_length(distance)} away from everything, and {format_length(part.size)} large"
     yield _entry(part, "floats", severity, text, value=distance, limit=sweep.reach, unit="m")
 
@@ -216,13 +217,17 @@ def _floating(part: MovingPart, sweep: Sweep) -> Iterator[MotionFinding]:
 def _gap(part: MovingPart, sweep: Sweep) -> Iterator[MotionFinding]:
     limit = max(GAP * part.size, LEAST_GAP)
     if sweep.rest_gap > limit and not part.is_robot_link:
-        far = f"at least {format_length(sweep.reach)}" if np.isinf(sweep.rest_gap) else format_length(sweep.rest_gap)
+        far = (
+            f"at least {format_length(sweep.reach)}"
+            if np.isinf(sweep.rest_gap)
+            else format_length(sweep.rest_gap)
+        )
         value = None if np.isinf(sweep.rest_gap) else sweep.rest_gap
         text = f"is {far} away from everything at rest"
         yield _entry(part, "gap", "suspect", text, value=value, limit=limit, unit="m")
 
 
-def _entering(part: MovingPart, sweep: Sweep, overlap: Overlap) -> MotionFinding:
+def _entering(part: MovingPart, sweep: Sweep, overlap: SweptOverlap) -> MotionFinding:
     at = overlap.state[part.coordinate]
     lower, upper = part.limits
     what = f"enters '{overlap.bodies[1]}' by {format_length(overlap.depth)}"
@@ -234,8 +239,17 @@ def _entering(part: MovingPart, sweep: Sweep, overlap: Overlap) -> MotionFinding
         explained = _explain(part, sweep)
         if explained:
             kind, what = explained[0], f"{what}; {explained[1]}"
-    values = {"value": overlap.depth, "limit": overlap.limit, "unit": "m", "state": overlap.state}
-    return _entry(part, kind, "suspect", what, bodies=overlap.bodies, **values)
+    return _entry(
+        part,
+        kind,
+        "suspect",
+        what,
+        value=overlap.depth,
+        limit=overlap.limit,
+        unit="m",
+        state=overlap.state,
+        against=overlap.bodies[1],
+    )
 
 
 def _explain(part: MovingPart, sweep: Sweep) -> tuple[str, str] | None:
@@ -259,7 +273,8 @@ def _is_free_about(part: MovingPart, sweep: Sweep, direction: Floats, point: Flo
     parts, model = part.parts, Model()
     near = sorted({other for _, other in sweep._rests} | {o for o in sweep.others if o in sweep._own_pairs})
     lower, upper = part.range
-    joint = {"name": "q", "parent": "world", "child": "moved", "axis": tuple(direction.tolist())}
+    joint: dict[str, Any] = {"name": "q", "parent": "world", "child": "moved"}
+    joint["axis"] = tuple(direction.tolist())
     joint["origin"] = Pose.from_matrix(transform(np.eye(3), point))
     place = inverse(transform(np.eye(3), point))
     with model.edit() as edit:
@@ -280,7 +295,9 @@ def _is_free_about(part: MovingPart, sweep: Sweep, direction: Floats, point: Flo
     for k, value in enumerate([0.0, *(np.linspace(lower, upper, STATES) - part.home).tolist()]):
         scene.update({q: value})
         found = query()
-        seen = {tuple(p): d for p, d in zip(found.body_indices.tolist(), found.distances.tolist(), strict=True)}
+        seen = {
+            tuple(p): d for p, d in zip(found.body_indices.tolist(), found.distances.tolist(), strict=True)
+        }
         rest = rest if k else seen
         depths = ((max(0.0, -rest.get(pair, 0.0)), -distance) for pair, distance in seen.items())
         if not rest.keys() & seen.keys() or any(d - b > accepted_depth(b, part.size) for b, d in depths):
@@ -298,11 +315,12 @@ def _entry(
     severity: Severity,
     text: str,
     *,
-    bodies: tuple[str, ...] = (),
     value: float | None = None,
     limit: float | None = None,
     unit: str = "",
     state: State | None = None,
+    against: str = "",
 ) -> MotionFinding:
     at = {} if state is None else {str(part.coordinate): float(state[part.coordinate])}
-    return MotionFinding(kind, severity, text, bodies or part.bodies, part.group.joint, value, limit, unit, at)
+    joint = part.group.joint
+    return MotionFinding(kind, severity, text, part.bodies, joint, value, limit, unit, at, against)

@@ -59,7 +59,7 @@ class BrokenModel:
 
 
 def load_models(folders: Sequence[Path]) -> dict[str, Model]:
-    """Return the models by name: those of :data:`SOUND`, and all in some folders that have joints and shapes."""
+    """Return models by name: those of :data:`SOUND`, and those in folders that have joints and shapes."""
     models = {name: load(name) for name in SOUND}
     for folder in folders:
         if not folder.is_dir():
@@ -120,7 +120,9 @@ def _judge(
     coordinate = joint.coordinate
     before = Counter(_key(entry) for entry in sound[coordinate].entries)
     new = [entry for entry in report[coordinate].entries if not before[_key(entry)]]
-    said = [e.kind for e in new if e.severity == "finding" or (not break_.is_certain and e.severity == "suspect")]
+    said = [
+        e.kind for e in new if e.severity == "finding" or (not break_.is_certain and e.severity == "suspect")
+    ]
     is_named = any(kind in break_.kinds for kind in said)
     return BrokenModel(break_.name, name, coordinate, bool(said), is_named, tuple(e.kind for e in new))
 
@@ -129,9 +131,7 @@ def _key(entry: MotionFinding) -> tuple[str, ...]:
     return entry.kind, entry.severity, entry.joint
 
 
-def report_checks(
-    seeds: Sequence[int], sound: dict[str, MotionReport], broken: list[BrokenModel]
-) -> Report:
+def report_checks(seeds: Sequence[int], sound: dict[str, MotionReport], broken: list[BrokenModel]) -> Report:
     rows = []
     for break_ in BREAKS:
         some = [one for one in broken if one.break_ == break_.name]
@@ -150,7 +150,9 @@ def report_checks(
         if report.findings or report.suspects
     ]
     said += [("all", sum(row[1] for row in said), sum(row[2] for row in said), f"{len(sound)} models")]
-    missed = [(one.break_, one.model, one.coordinate, ", ".join(one.said)) for one in broken if not one.is_found]
+    missed = [
+        (one.break_, one.model, one.coordinate, ", ".join(one.said)) for one in broken if not one.is_found
+    ]
     return Report(
         name="checks",
         title=f"Motion checks of models broken on purpose, seeds {seeds[0]} to {seeds[-1]}",

@@ -64,7 +64,13 @@ class SoundJoint:
     def world_T_joint(self) -> Array:
         parent = self.joint.parent
         pose: Array = np.eye(4) if parent == "world" else self.model.fk(parent)(self.part.parts.default)
-        return np.asarray(pose @ self.joint.origin.matrix)
+        return np.asarray(pose @ self.origin)
+
+    @property
+    def origin(self) -> Array:
+        """Pose of the joint in its parent, (4, 4)."""
+        assert isinstance(self.joint.origin, Pose)
+        return self.joint.origin.matrix
 
     @property
     def axis(self) -> Array:
@@ -117,7 +123,7 @@ def _moved_axis(broken: SoundJoint, joint_T_new: Array, **changes: Any) -> Model
     """Return the model with the axis at another pose in the frame of the joint, and the part where it was."""
     model, joint = broken.model.copy(), broken.joint
     between = f"{joint.child}/moved axis"
-    origin = Pose.from_matrix(joint.origin.matrix @ joint_T_new)
+    origin = Pose.from_matrix(broken.origin @ joint_T_new)
     with model.edit() as edit:
         edit.replace(broken.tag, replace(joint, child=between, origin=origin, **changes))
         back = AddFrame(joint.child, Frame(between, (Pose.from_matrix(inverse(joint_T_new)),)))
@@ -143,14 +149,14 @@ def _is_hinge(broken: SoundJoint) -> bool:
 
 
 def _degrees(broken: SoundJoint, rng: np.random.Generator, folder: Path) -> Model:
-    return _replaced(
-        broken, lower=math.degrees(broken.joint.lower), upper=math.degrees(broken.joint.upper)
-    )
+    lower, upper = broken.part.limits
+    return _replaced(broken, lower=math.degrees(lower), upper=math.degrees(upper))
 
 
 def _millimetres(broken: SoundJoint, rng: np.random.Generator, folder: Path) -> Model:
     factor = float(rng.choice([1e3, 1e-3]))
-    return _replaced(broken, lower=factor * broken.joint.lower, upper=factor * broken.joint.upper)
+    lower, upper = broken.part.limits
+    return _replaced(broken, lower=factor * lower, upper=factor * upper)
 
 
 def _across(rng: np.random.Generator, direction: Array) -> Array:
@@ -171,7 +177,9 @@ def _moves_nothing(broken: SoundJoint, rng: np.random.Generator, folder: Path) -
     model, joint = broken.model.copy(), broken.joint
     with model.edit() as edit:
         edit.replace(broken.tag, replace(joint, child=f"{joint.child}/empty"))
-        edit.insert(AddFrame(joint.child, Frame(joint.parent, (joint.origin,))), after=broken.tag)
+        edit.insert(
+            AddFrame(joint.child, Frame(joint.parent, (Pose.from_matrix(broken.origin),))), after=broken.tag
+        )
     return model
 
 
@@ -184,9 +192,9 @@ def _floats(broken: SoundJoint, rng: np.random.Generator, folder: Path) -> Model
     reach = float(np.linalg.norm(own - at, axis=1).max()) + (0.0 if _is_hinge(broken) else broken.span)
     radius = float(np.linalg.norm(others - middle, axis=1).max())
     target = middle + (radius + reach + part.size * rng.uniform(0.5, 2.0)) * unit_vector(rng.normal(size=3))
-    parent = broken.world_T_joint @ inverse(broken.joint.origin.matrix)
+    parent = broken.world_T_joint @ inverse(broken.origin)
     shift = parent[:3, :3].T @ (target - at)
-    return _replaced(broken, origin=Pose.from_matrix(translation(shift) @ broken.joint.origin.matrix))
+    return _replaced(broken, origin=Pose.from_matrix(translation(shift) @ broken.origin))
 
 
 def _body_of(broken: SoundJoint, rng: np.random.Generator) -> str:
@@ -357,7 +365,13 @@ BREAKS = (
         _hinge_in_the_middle,
     ),
     Break("axis flipped", ("flipped_axis",), False, _is_one_sided, _flipped),
-    Break("type swapped", ("comes_apart", "into_carrier", "flipped_axis", "turned_axis"), False, _has_range, _swapped),
+    Break(
+        "type swapped",
+        ("comes_apart", "into_carrier", "flipped_axis", "turned_axis"),
+        False,
+        _has_range,
+        _swapped,
+    ),
     Break("scale", ("wrong_scale",), False, _always, _scaled),
     Break("axis turned", ("turned_axis", "into_carrier"), False, _has_range, _turned),
 )
