@@ -95,9 +95,10 @@ def load(
     ----------
     source
         Path of a ``.urdf``, ``.sdf``, ``.xml`` (MJCF, or URDF), ``.usda``, ``.xacro``, ``.kv.json`` or
-        ``.kv.msgpack`` file, or of a ``mobility_v2.json`` or its folder; or a name such as ``kitchen``, ``pr2``
-        or ``articulations/screw``, see :func:`kineverse.formats.locate.locate_model`. ``live:NAME`` is a model
-        that other processes edit as well: the result follows it, and edits of the result are theirs.
+        ``.kv.msgpack`` file, or of a ``mobility_v2.json`` or its folder; or a name such as ``kitchen``,
+        ``pr2`` or ``articulations/screw``, see :func:`kineverse.formats.locate.locate_model`. ``live:NAME``
+        is a model that other processes edit as well: the result follows it, and edits of the result are
+        theirs.
     prefix
         Prefix of the names of all frames and degrees of freedom, without the slash. A shipped model has its
         own name as prefix unless another is given (``screw`` for ``articulations/screw``); ``""`` means none.
