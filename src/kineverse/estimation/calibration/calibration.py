@@ -6,6 +6,7 @@ import math
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any, NamedTuple, TypeAlias
 from weakref import WeakKeyDictionary
 
@@ -13,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from kineverse._checks import as_count, as_positive
-from kineverse.errors import InvalidValueError, UnknownNameError, list_some, suggest
+from kineverse.errors import DuplicateNameError, InvalidValueError, UnknownNameError, list_some, suggest
 from kineverse.estimation.noise import Outliers, as_outliers
 from kineverse.formats.saver import save_corrections
 from kineverse.lie import Array
@@ -29,21 +30,19 @@ from .corrections import (
     corrected_operation,
     find_corrections,
     parameterised_operation,
-    replace_parameters,
+    with_parameters,
 )
 from .hand_eye import start_mounts
 from .observations import (
-    BlockSource,
     CompiledBlock,
     Kernel,
-    Look,
     ObservedRow,
     ResidualBlock,
     build_kernel,
     make_block,
     read_look,
 )
-from .solver import CalibrationFit, CalibrationProblem, Linearised, check_residuals, pseudo_inverse
+from .solver import FINEST, CalibrationFit, CalibrationProblem, Linearised, check_residuals, pseudo_inverse
 
 Mask: TypeAlias = "npt.NDArray[np.bool_]"
 
@@ -75,6 +74,7 @@ class _Prepared:
     corrections: list[Correction]
     unknowns: list[_Unknown]
     model: Model
+    names: dict[str, Symbol]  # symbols of the model by name
     kernels: dict[tuple[Any, ...], Kernel] = field(default_factory=dict)
 
 
@@ -94,8 +94,8 @@ class Calibration:
         Covariance of the parameters in the order of ``state``, (p, p), of the directions that the data tell:
         with the others held where they were.
     deviations
-        Standard deviation of each parameter by name, infinite for one with a share in an unobservable
-        direction.
+        Standard deviation of each parameter by name, infinite for one that is uncertain mostly by its share
+        in an unobservable direction.
     unobservable
         Directions that the data do not tell, each as {name: coefficient} of unit length in parameters scaled
         by their prior sizes, 1 m, 1 rad, or the present value of a free symbol. A direction is told if its
@@ -110,8 +110,6 @@ class Calibration:
         left out, each in one of several parts, by the model from the others.
     looks
         Number of looks.
-    operations
-        Corrected operations by tag.
     """
 
     state: State
@@ -123,10 +121,23 @@ class Calibration:
     before: Mapping[str, float]
     held_out: Mapping[str, float]
     looks: int
-    operations: Mapping[str, Operation]
     units: Mapping[str, str]
     calibrated: Mapping[str, Operation] = field(repr=False)  # operations before, by tag
     model: Model = field(repr=False)  # the model that was calibrated
+    corrections: tuple[Correction, ...] = field(repr=False)
+
+    @cached_property
+    def operations(self) -> Mapping[str, Operation]:
+        """Corrected operations by tag."""
+        values = [self.state.vector([parameter(s.path, 0.0) for s in c.symbols]) for c in self.corrections]
+        new = {s: parameter(s.path, v) for s, v in self.state.items() if not self.units[str(s)]}
+        result = {}
+        for tag, operation in self.calibrated.items():
+            own = [i for i, correction in enumerate(self.corrections) if correction.tag == tag]
+            numbers = [values[i].tolist() for i in own]
+            corrected = corrected_operation(operation, [self.corrections[i] for i in own], numbers)
+            result[tag] = with_parameters(corrected, new)
+        return result
 
     def apply(self, model: Model) -> int:
         """Replace the operations of a model by the corrected ones, in one edit; return its new version.
@@ -134,7 +145,8 @@ class Calibration:
         Raises
         ------
         InvalidValueError
-            If the model's operations are not those that were calibrated, as after a first ``apply``.
+            If the model's operations are not those that were calibrated, as after a first ``apply``, or a
+            free symbol stands in an operation without its class.
         """
         for tag, operation in self.calibrated.items():
             entry = model.history.entries.get(tag)
@@ -144,8 +156,15 @@ class Calibration:
                     f"The calibration does not fit this model: its operation {tag!r} {how}. Calibrate the "
                     "model as it is now, or undo the change."
                 )
+        old = [s for s in self.state if not self.units[str(s)]]
         with model.edit() as edit:
             self.write(edit)
+            left = [str(s) for s in old if s in edit.model.symbols and s.value != self.state[s]]
+            if left:
+                raise InvalidValueError(
+                    f"The value of {list_some(map(repr, left), 4)} cannot be set in this model: it stands in "
+                    "operations of a document without their classes. Pass calibration.state with the values."
+                )
         return model.version
 
     def save(
@@ -198,7 +217,9 @@ class Calibration:
         if self.outliers:
             looks = sorted({outlier.look for outlier in self.outliers})
             lines.append(f"{len(self.outliers)} gross errors, in looks {list_some(looks, 12)}")
-        lines += [f"not told by the data: {format_direction(one)}" for one in self.unobservable]
+        alone = [name for one in self.unobservable if len(one) == 1 for name in one]
+        lines += [f"not told by the data: {', '.join(alone)}"] if alone else []
+        lines += [f"not told by the data: {format_direction(d)}" for d in self.unobservable if len(d) > 1]
         return "\n".join(lines)
 
 
@@ -215,7 +236,7 @@ _GROUP_UNITS = {"position": "m", "point": "m", "orientation": "rad", "pixel": "p
 def _format(value: float, deviation: float, unit: str) -> str:
     factor, shown = _UNITS.get(unit, (1.0, unit))
     if math.isinf(deviation):
-        return f"{factor * value:+.6g} {shown}, not told alone".replace("  ", " ")
+        return f"{factor * value:+.4g} {shown}".rstrip() + ", not told"
     return f"{factor * value:+.4g} ± {factor * deviation:.2g} {shown}".rstrip()
 
 
@@ -273,6 +294,10 @@ def calibrate(
         raise InvalidValueError(f"A model is calibrated, as from kv.load(...), not {model!r:.60}.")
     kinds = as_outliers(outliers)
     folds = 0 if not held_out else as_count("held_out", held_out, 2)
+    if isinstance(recordings, Mapping | str) or not isinstance(recordings, Iterable):
+        raise InvalidValueError(
+            f"Recordings are a list of looks (state, observations), not {recordings!r:.60}."
+        )
     prepared = _prepare(model, free)
     blocks = _make_blocks(model, prepared, list(recordings))
     unknowns = prepared.unknowns
@@ -285,7 +310,13 @@ def calibrate(
     before = problem.linearise(present / scales)
     check_residuals(before, blocks)
     _check_count(problem, len(unknowns))
-    fit = problem.solve(_start(problem, prepared, place, present) / scales)
+    if not any(len(one.jacobian) and one.jacobian.any() for one in before):
+        raise InvalidValueError(
+            "No observation depends on what is free: "
+            f"{list_some((str(u.outer) for u in unknowns), 6)}. Free something between the observed frames."
+        )
+    fit = problem.solve(_start(problem, prepared, place, present) / scales, present / scales)
+    _check_explained(problem, fit)
     return _result(model, prepared, problem, fit, before, folds)
 
 
@@ -320,11 +351,14 @@ def _parameterise(model: Model, items: Sequence[str | Symbol]) -> _Prepared:
     ]
     symbols = dict.fromkeys(item for item in items if isinstance(item, Symbol))
     unknowns += [_Unknown(s, s, "", abs(s.value or 0.0) or 1.0) for s in symbols]
+    names = [str(unknown.outer) for unknown in unknowns]
+    if twice := sorted({name for name in names if names.count(name) > 1}):
+        raise DuplicateNameError(f"Two free parameters have the name '{twice[0]}'; rename that of the model.")
     scratch = model.copy()
     with scratch.edit() as edit:
         for tag, group in _by_tag(corrections).items():
             edit.replace(tag, parameterised_operation(model.history.operation(tag), group))
-    return _Prepared(corrections, unknowns, scratch)
+    return _Prepared(corrections, unknowns, scratch, {str(s): s for s in model.symbols})
 
 
 def _by_tag(corrections: Iterable[Correction]) -> dict[str, list[Correction]]:
@@ -342,12 +376,12 @@ def _make_blocks(model: Model, prepared: _Prepared, recordings: Sequence[Any]) -
     states: dict[int, State] = {}
     rows: dict[tuple[Any, ...], list[ObservedRow]] = {}
     blocks: list[ResidualBlock] = []
-    names = {str(s) for s in model.symbols}
+    names = prepared.names
     for index, recording in enumerate(recordings):
-        if not isinstance(recording, Look) and isinstance(recording, BlockSource):
+        if hasattr(recording, "residual_block"):
             blocks.append(recording.residual_block(prepared.model, inner, index))
             continue
-        state, seen = read_look(model, index, recording)
+        state, seen = read_look(model, names, index, recording)
         states[index] = state
         for row in seen:
             rows.setdefault((*row.key, row.covariance is None), []).append(row)
@@ -356,6 +390,11 @@ def _make_blocks(model: Model, prepared: _Prepared, recordings: Sequence[Any]) -
         kernel = prepared.kernels.get(key)
         if kernel is None:
             kernel = prepared.kernels[key] = build_kernel(prepared.model, key[:-1], inner)
+        if key[0] == "expression" and not kernel.parameters:
+            raise InvalidValueError(
+                f"'{key[1]}' does not depend on what is free. An expression has its own parameters only: one "
+                "made of a model's frames does not follow corrections of them. Observe the frame instead."
+            )
         used.update(map(str, kernel.coordinates))
         blocks.append(make_block(kernel, group, states))
     for index, state in states.items():
@@ -418,6 +457,74 @@ def _size(block: ResidualBlock) -> int:
     return max(int(group.rows.stop) for group in block.groups)
 
 
+_CONFUSED = (
+    "Check the names of joints and frames, that lengths are in metres and angles in radians, and that states "
+    "and observations belong together."
+)
+_CERTAIN = math.log(20.0)  # log odds against a wrong refusal
+_LOG_ANY_ORIENTATION = -Outliers(reach=1.0).log_uniform_density  # log volume of all orientations [rad³]
+
+
+def _check_explained(problem: CalibrationProblem, fit: CalibrationFit) -> None:
+    """Refuse recordings that the model does not explain, even with its best parameters.
+
+    Three other explanations compete: that all observations are gross errors, that all orientations are, and
+    that the observations of each kind are a constant and noise. The criterion is the Bayesian one, with the
+    correction for few data where the size of the noise is estimated (McQuarrie, 1999).
+    """
+    count, inliers = sum(map(len, fit.weights)), sum(float(w.sum()) for w in fit.weights)
+    sizes = ", ".join(_format_size(size, name) for name, size in fit.noise.items())
+    if inliers < count / 2:
+        raise InvalidValueError(
+            f"The recordings do not fit the model: only {inliers:.0f} of {count} observations agree with it"
+            f"{f' to {sizes}' if sizes else ''}, and more than half have to. {_CONFUSED}"
+        )
+    outliers = problem.outliers or Outliers()
+    over_errors, over_constant = -problem.mixture(fit.linear, fit.noise)[1], 0.0
+    numbers, constants = 0.0, 0
+    turns, over_turns = 0.0, 0.0  # orientations, and their log likelihood ratio to any orientation
+    for i, (block, weights) in enumerate(zip(problem.blocks, fit.weights, strict=True)):
+        residual, constant = fit.linear[i].residual, block.scatter()
+        rows = residual.shape[1]
+        numbers += rows * float(weights.sum())
+        over_errors -= len(weights) * block.log_outlier_density(outliers)
+        deviations = problem.deviations(i, fit.noise) * np.ones(rows)
+        for group in block.groups:
+            part, used = group.rows, float(weights.sum())
+            if group.name == "orientation" and problem.whiten[i] is None:
+                square = float(weights @ np.square(residual[:, part] / deviations[part]).sum(axis=1))
+                log_scale = 1.5 * math.log(math.tau) + float(np.log(deviations[part]).sum())
+                turns += 3 * used
+                over_turns += used * (_LOG_ANY_ORIENTATION - log_scale) - square / 2
+        if constant is None or problem.whiten[i] is not None:
+            over_constant = math.inf
+            continue
+        constants += rows
+        for group in block.groups:
+            mine, other = (
+                float(weights @ np.square(one[:, group.rows]).sum(axis=1)) for one in (residual, constant)
+            )
+            width = residual[:, group.rows].shape[1] * float(weights.sum())
+            least = width * FINEST**2
+            over_constant += width / 2 * math.log(max(other, least) / max(mine, least))
+
+    def penalty(parameters: int) -> float:
+        few = numbers / max(numbers - parameters - 2.0, 1.0) if problem.unknown else 1.0
+        return parameters / 2 * math.log(max(numbers, 2.0)) * few
+
+    share = turns / max(numbers, 1.0)
+    if over_errors < penalty(fit.rank) or (turns and over_turns < share * penalty(fit.rank)):
+        raise InvalidValueError(
+            f"The recordings do not fit the model: with its best parameters it is off by {sizes}, which is "
+            f"no better than gross errors only. {_CONFUSED} With few looks, noise= or more of them help."
+        )
+    if over_constant + _CERTAIN < penalty(fit.rank) - penalty(constants):
+        raise InvalidValueError(
+            f"The recordings do not fit the model: with its best parameters it is off by {sizes}, and a "
+            f"constant for each observed frame explains them as well. Or the joints hardly move. {_CONFUSED}"
+        )
+
+
 def _start(
     problem: CalibrationProblem, prepared: _Prepared, place: Mapping[Symbol, int], present: Array
 ) -> Array:
@@ -454,27 +561,18 @@ def _result(
     folds: int,
 ) -> Calibration:
     unknowns, scales = prepared.unknowns, problem.scales
-    values = fit.values * scales
+    # What no observation depends on is exactly as it was.
+    present = np.array([u.outer.value or 0.0 for u in unknowns])
+    values = np.where(np.diag(fit.hessian) > 0.0, fit.values * scales, present)
     names = [str(u.outer) for u in unknowns]
     covariance = pseudo_inverse(fit.hessian)[0] * np.outer(scales, scales)
     directions, deviations = _directions(problem, fit)
     state = State({u.outer: float(v) for u, v in zip(unknowns, values, strict=True)}, source="calibration")
-    place = {u.inner: i for i, u in enumerate(unknowns)}
-    operations: dict[str, Operation] = {}
-    for tag, group in _by_tag(prepared.corrections).items():
-        numbers = [[float(values[place[s]]) for s in c.symbols] for c in group]
-        operations[tag] = corrected_operation(model.history.operation(tag), group, numbers)
-    new = {
-        u.inner: parameter(u.inner.path, float(v))
-        for u, v in zip(unknowns, values, strict=True)
-        if not u.inner.has_derivative
-    }
+    tags = set(_by_tag(prepared.corrections))
+    new = {u.inner: parameter(u.inner.path, math.pi) for u in unknowns if not u.inner.has_derivative}
     if new:
-        for tag in model.history.tags:
-            operation = operations.get(tag, model.history.operation(tag))
-            replaced = replace_parameters(operation, new)
-            if replaced is not operation:
-                operations[tag] = replaced
+        ours = {tag: model.history.operation(tag) for tag in model.history.tags}
+        tags |= {tag for tag, one in ours.items() if with_parameters(one, new) is not one}
     outliers = tuple(
         Outlier(int(block.looks[k]), block.label, float(weights[k]))
         for block, weights in zip(problem.blocks, fit.weights, strict=True)
@@ -492,10 +590,10 @@ def _result(
         _rms(problem, before, inliers),
         _held_out(problem, fit, inliers, looks, folds),
         len(looks),
-        operations,
         {str(u.outer): u.unit for u in unknowns},
-        {tag: model.history.operation(tag) for tag in operations},
+        {tag: model.history.operation(tag) for tag in model.history.tags if tag in tags},
         model,
+        tuple(prepared.corrections),
     )
 
 
@@ -503,11 +601,11 @@ def _directions(problem: CalibrationProblem, fit: CalibrationFit) -> tuple[list[
     """Return the directions that the data do not tell, and the standard deviations of all parameters."""
     count = len(problem.scales)
     values, axes = np.linalg.eigh(fit.hessian)
-    untold = axes[:, : count - fit.rank].T
-    floor = max(float(values[-1]) * 1e-14 * count, 1e-300)
-    spread = (axes**2 / np.maximum(values, floor)).sum(axis=1)
-    deviations = np.where(spread > 1.0, math.inf, np.sqrt(spread))
-    return _simple_basis(untold), deviations
+    untold, told = np.split(axes, [count - fit.rank], axis=1)
+    # An untold direction is as uncertain as its prior size. What it adds may be small beside the rest.
+    further = np.square(untold).sum(axis=1)
+    own = (np.square(told) / values[count - fit.rank :]).sum(axis=1)
+    return _simple_basis(untold.T), np.where(further > own, math.inf, np.sqrt(own + further))
 
 
 def _simple_basis(rows: Array) -> list[Array]:

@@ -60,9 +60,9 @@ class _Word(NamedTuple):
 
 def _origin(operation: Any) -> Factors:
     """Return the factors of the pose that a placed operation gives its frame at coordinate 0."""
-    factors: Factors = (
-        (operation.origin,) if isinstance(operation, PlacedOperation) else operation.frame.factors  # type: ignore[assignment]
-    )
+    if isinstance(operation, PlacedOperation):
+        return (_as_pose(operation.origin),)
+    factors: Factors = operation.frame.factors
     return factors
 
 
@@ -298,8 +298,18 @@ def _kind(correction: Correction, operation: Operation) -> str:
     return "mecanum" if correction.word == "wheels" and isinstance(operation, Mecanum) else correction.word
 
 
+def with_parameters(operation: Operation, new: Mapping[Symbol, Symbol]) -> Operation:
+    """Return an operation with parameters replaced by others of other values; itself if it has none."""
+    if isinstance(operation, Override):
+        inner = with_parameters(operation.operation, new)
+        return operation if inner is operation.operation else replace(operation, operation=inner)
+    mine = operation.rebuild() or operation
+    replaced: Operation = replace_parameters(mine, new)
+    return operation if replaced is mine else replaced
+
+
 def replace_parameters(value: Any, new: Mapping[Symbol, Symbol]) -> Any:
-    """Return a field of an operation, or an operation, with parameters replaced by others of other values."""
+    """Return a field with parameters replaced by others of other values; itself if it has none."""
     if isinstance(value, Expression):
         return value.substitute(new) if any(symbol in new for symbol in value.symbols) else value
     if isinstance(value, tuple):
@@ -345,8 +355,9 @@ def _matching(model: Model, word: str, pattern: str) -> list[Correction]:
         tags = {**{name: _writer(model, "frames", name) for name in model.frames}, **tags}
     matching = {name: tag for name, tag in tags.items() if fnmatchcase(name, pattern)}
     if not matching:
-        kind = "joint or frame" if kinds[0] in ("mount", "length") else "joint"
-        raise UnknownNameError(f"Nothing is named '{pattern}'. {suggest(pattern, tags, kind)}")
+        kind = "joints and frames" if kinds[0] in ("mount", "length") else "joints"
+        hint = suggest(pattern, tags, "such name")
+        raise UnknownNameError(f"Nothing is named '{pattern}' among the {kind}. {hint}")
     result: dict[str, Correction] = {}
     for name, tag in matching.items():
         operation = _inner(model.history.operation(tag)) if tag else None

@@ -29,7 +29,7 @@ from kineverse.lie import (
 
 from .observations import CompiledBlock
 
-_ROUNDS = 6  # of weights
+_ROUNDS = 4  # of weights
 _PROBE = np.array([0.3, -0.2, 0.4, 0.5, 0.7, -0.6])  # any mount far from the identity [m], [rad]
 _AGREES = 1e-6  # difference of two forms of one pose, which rounding explains [m], [rad]
 

@@ -16,8 +16,22 @@ import numpy as np
 import numpy.typing as npt
 
 from kineverse.compilation import CompiledFunction, compile
-from kineverse.errors import InvalidValueError, ShapeError, UnknownNameError, list_some, suggest
-from kineverse.estimation.noise import Outliers, as_numbers, check_covariance, check_finite, check_rigid
+from kineverse.errors import (
+    InvalidValueError,
+    KineverseError,
+    ShapeError,
+    UnknownNameError,
+    list_some,
+    suggest,
+)
+from kineverse.estimation.noise import (
+    UNKNOWN_NOISE,
+    Outliers,
+    as_numbers,
+    check_covariance,
+    check_finite,
+    check_rigid,
+)
 from kineverse.estimation.tracking.measurements import (
     ObservedExpression,
     ObservedPose,
@@ -82,7 +96,8 @@ class Look:
     observations
         Observed values by what was observed: a 4×4 pose by the name of its frame, or by a pair (frame,
         reference); any value by :class:`ObservedPose`, :class:`ObservedPosition` or
-        :class:`ObservedExpression`. Or a list of such pairs, and of :class:`ObservedPixel`.
+        :class:`ObservedExpression`, which follows its own parameters only and no corrections. Or a list of
+        such pairs, and of :class:`ObservedPixel`.
     """
 
     state: StateLike
@@ -95,6 +110,7 @@ class NoiseGroup(NamedTuple):
     name: str  # groups of one name have the same size in all blocks
     unit: str  # m, rad or px
     rows: slice
+    median: float | None = None  # of its unknown size, log-normal with a factor of 5; None for any size
 
 
 class ResidualBlock(Protocol):
@@ -177,7 +193,8 @@ class CompiledBlock:
 
     def __post_init__(self) -> None:
         self.parameters = self.kernel.parameters
-        self.groups = _GROUPS[self.kind](self.label)
+        size = self.kernel.function.shapes[0][0]
+        self.groups = _GROUPS.get(self.kind) or (NoiseGroup(self.label, "", slice(0, size)),)
         start = len(self.kernel.coordinates)
         self._columns = slice(start, start + len(self.parameters))
 
@@ -226,14 +243,13 @@ class CompiledBlock:
         return np.concatenate([poses[:, :, 3] - poses[:, :, 3].mean(axis=0), turned], axis=1)
 
 
-_GROUPS: dict[str, Callable[[str], tuple[NoiseGroup, ...]]] = {
-    "pose": lambda _: (
-        NoiseGroup("position", "m", slice(0, 3)),
-        NoiseGroup("orientation", "rad", slice(3, 6)),
+_GROUPS = {
+    "pose": (
+        NoiseGroup("position", "m", slice(0, 3), UNKNOWN_NOISE[0]),
+        NoiseGroup("orientation", "rad", slice(3, 6), UNKNOWN_NOISE[1]),
     ),
-    "position": lambda _: (NoiseGroup("point", "m", slice(0, 3)),),
-    "pixel": lambda _: (NoiseGroup("pixel", "px", slice(0, 2)),),
-    "expression": lambda label: (NoiseGroup(label, "", slice(0, None)),),
+    "position": (NoiseGroup("point", "m", slice(0, 3), UNKNOWN_NOISE[0]),),
+    "pixel": (NoiseGroup("pixel", "px", slice(0, 2), 1.0),),
 }
 
 
@@ -361,8 +377,10 @@ class ObservedRow(NamedTuple):
     look: int
 
 
-def read_look(model: ModelView, index: int, given: object) -> tuple[State, list[ObservedRow]]:
-    """Check a look, and return its state and observations."""
+def read_look(
+    model: ModelView, known: Mapping[str, Symbol], index: int, given: object
+) -> tuple[State, list[ObservedRow]]:
+    """Check a look, and return its state and observations; ``known`` are symbols by name."""
     if isinstance(given, Look):
         state, observations = given.state, given.observations
     else:
@@ -373,7 +391,14 @@ def read_look(model: ModelView, index: int, given: object) -> tuple[State, list[
                 f"Look {index} is a pair (state, observations), kv.estimation.Look(state, observations) or "
                 f"a recording with a residual block, not {given!r:.80}."
             ) from None
-    values = state if isinstance(state, State) else State(state)
+    if not isinstance(state, (State, Mapping)):
+        raise InvalidValueError(
+            f"The state of look {index} is a mapping {{joint: value}}, not {state!r:.60}."
+        )
+    try:
+        values = state if isinstance(state, State) else State(_by_symbol(state, known))
+    except KineverseError as error:
+        raise InvalidValueError(f"The state of look {index} has no values for a model. {error}") from None
     items: Iterable[Any] = observations.items() if isinstance(observations, Mapping) else observations
     if isinstance(observations, (str, np.ndarray)) or not isinstance(items, Iterable):
         raise InvalidValueError(
@@ -383,6 +408,12 @@ def read_look(model: ModelView, index: int, given: object) -> tuple[State, list[
     if not rows:
         raise InvalidValueError(f"Look {index} has no observations; leave it out.")
     return values, rows
+
+
+def _by_symbol(state: Mapping[Any, float], known: Mapping[str, Symbol]) -> dict[Any, float]:
+    # Names of the model need not be parsed.
+    result = {known.get(key, key): value for key, value in state.items()}
+    return result if len(result) == len(state) else dict(state)
 
 
 def _row(model: ModelView, look: int, item: Any) -> ObservedRow:
@@ -403,13 +434,13 @@ def _row(model: ModelView, look: int, item: Any) -> ObservedRow:
         expression = array(what.expression)
         size = 1 if not expression.shape else expression.shape[0]
         part = f"value of '{what.name}' in look {look}"
-        data = as_numbers(value, f"The {part}").reshape(-1)
-        if data.shape != (size,):
-            raise ShapeError(f"The {part} has {size} numbers, not {data.shape}.")
+        numbers = as_numbers(value, f"The {part}").reshape(-1)
+        if len(numbers) != size:
+            raise ShapeError(f"The {part} has {size} numbers, not {len(numbers)}.")
         period = math.inf if what.period is None else float(what.period)
         key: tuple[Any, ...] = ("expression", what.name, expression, period)
-        check_finite(data[None], part, "Value")
-        return ObservedRow(key, what.name, data, require_covariance(what.covariance, size, what.name), look)
+        covariance = require_covariance(what.covariance, size, what.name)
+        return ObservedRow(key, what.name, numbers, covariance, look)
     if not isinstance(what, (ObservedPose, ObservedPosition)):
         raise InvalidValueError(
             f"Look {look} observes names of frames, pairs (frame, reference), ObservedPose, "
@@ -422,20 +453,17 @@ def _row(model: ModelView, look: int, item: Any) -> ObservedRow:
     if isinstance(what, ObservedPosition):
         if data.shape != (3,):
             raise ShapeError(f"The position of {part} is three numbers [m], not of shape {data.shape}.")
-        check_finite(data[None], part, "Position")
-        covariance = None if what.covariance is None else check_covariance(what.covariance, 3, part)
+        given = None if what.covariance is None else check_covariance(what.covariance, 3, part)
         point = np.asarray(what.point, dtype=float)
-        if point.shape != (3,) or not np.isfinite(point).all():
-            raise InvalidValueError(f"The point of {part} is three numbers [m], not {what.point!r}.")
+        if point.shape != (3,):
+            raise ShapeError(f"The point of {part} is three numbers [m], not {what.point!r}.")
         key = ("position", what.frame, what.relative_to)
-        return ObservedRow(key, label, np.concatenate([data, point]), covariance, look)
+        return ObservedRow(key, label, np.concatenate([data, point]), given, look)
     if data.shape != (4, 4):
-        hint = " A point is seen by ObservedPosition." if data.size == 3 else ""
+        hint = " A point is seen by ObservedPosition." if data.shape == (3,) else ""
         raise ShapeError(f"The pose of {part} is a 4×4 matrix, not of shape {data.shape}.{hint}")
-    check_rigid(data[None], part)
-    covariance = None if what.covariance is None else check_covariance(what.covariance, 6, part)
-    pose = np.asarray(orthonormalize(data))[:3].ravel()
-    return ObservedRow(("pose", what.frame, what.relative_to), label, pose, covariance, look)
+    given = None if what.covariance is None else check_covariance(what.covariance, 6, part)
+    return ObservedRow(("pose", what.frame, what.relative_to), label, data, given, look)
 
 
 def _pixel_row(model: ModelView, look: int, item: ObservedPixel) -> ObservedRow:
@@ -453,7 +481,6 @@ def _pixel_row(model: ModelView, look: int, item: ObservedPixel) -> ObservedRow:
         raise ShapeError(
             f"A pixel of {part} has pixel=(u, v), point=(x, y, z), focal=(fx, fy) and centre=(cx, cy)."
         )
-    check_finite(numbers[None], part, "Pixel")
     covariance = None if item.covariance is None else check_covariance(item.covariance, 2, part)
     return ObservedRow(("pixel", item.frame, item.camera, focal, centre), label, numbers, covariance, look)
 
@@ -481,7 +508,7 @@ def make_block(kernel: Kernel, rows: Sequence[ObservedRow], states: Mapping[int,
                 f"Look {row.look} has no value for {list_some(map(repr, missing), 12)}, which "
                 f"'{row.label}' depends on. Its state has {list_some(map(repr, map(str, state)), 6)}."
             ) from None
-        inputs[i, inputs.shape[1] - kernel.data :] = row.data
+    inputs[:, inputs.shape[1] - kernel.data :] = _stack(rows)
     covariance = None if first.covariance is None else np.stack([_covariance(row) for row in rows])
     looks = np.array([row.look for row in rows])
     wrong = np.flatnonzero(~np.isfinite(inputs).all(axis=1))
@@ -489,6 +516,19 @@ def make_block(kernel: Kernel, rows: Sequence[ObservedRow], states: Mapping[int,
         raise InvalidValueError(f"The state of look {looks[wrong[0]]} has a value that is not finite.")
     period = first.key[3] if first.key[0] == "expression" else math.inf
     return CompiledBlock(first.label, first.key[0], kernel, looks, inputs, covariance, period)
+
+
+def _stack(rows: Sequence[ObservedRow]) -> Array:
+    """Return the observed numbers of all rows, after a check of them."""
+    seen = np.stack([row.data for row in rows])
+    is_pose = rows[0].key[0] == "pose"
+    try:
+        check_rigid(seen, "") if is_pose else check_finite(seen, "")
+    except InvalidValueError:
+        for row in rows:  # which one it is
+            part = f"observation '{row.label}' in look {row.look}"
+            check_rigid(row.data[None], part) if is_pose else check_finite(row.data[None], part, "Value")
+    return np.asarray(orthonormalize(seen))[:, :3].reshape(-1, 12) if is_pose else seen
 
 
 def _covariance(row: ObservedRow) -> Array:

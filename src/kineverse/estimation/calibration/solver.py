@@ -3,8 +3,8 @@
 The first steps weigh observations by a Cauchy density whose scale is the median of the residuals, from which
 a start far away and a share of gross errors below one half converge. Then the mixture of
 :class:`.Outliers` weighs them, and the sizes of the noise are those at which the weighted residuals of each
-group have the variance expected with its share of the degrees of freedom (Förstner's estimate of variance
-components, that of restricted maximum likelihood).
+group have the variance expected with its share of the degrees of freedom (restricted maximum likelihood),
+with the prior of unknown noise that identification has.
 
 Parameters are scaled by their prior sizes. In a direction that the data tell less well than its prior size,
 steps are zero: so it stays where it was.
@@ -20,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 
 from kineverse.errors import InvalidValueError, NoSolutionError
-from kineverse.estimation.noise import Outliers
+from kineverse.estimation.noise import NOISE_SPREAD, Outliers
 from kineverse.estimation.tracking.residuals import whitening
 from kineverse.lie import Array
 
@@ -29,8 +29,9 @@ from .observations import ResidualBlock
 FINEST = 1e-7  # smallest standard deviation of an estimated noise [m], [rad]; below it rounding is larger
 _ROUNDING = 1e-14  # relative size of an eigenvalue of JᵀJ that is rounding
 _ROUGH, _STEPS, _HALVINGS = 40, 60, 8  # largest numbers of steps before and with the mixture, of halvings
-_SETTLED = 1e-9  # squared length of a step at convergence, in standard deviations
-_EVEN = 1e-4  # relative change of the sizes of noise at convergence
+_SETTLED = 1e-8  # squared length of a step at convergence, in standard deviations
+_NEAR = 1e-2  # the same of the last step before the mixture
+_EVEN = 1e-3  # relative change of the sizes of noise at convergence
 
 
 class Linearised(NamedTuple):
@@ -79,11 +80,11 @@ class CalibrationProblem:
             0.0 if w is None else -np.linalg.slogdet(w)[1] for w in self.whiten
         ]  # ½ log |S| of stated covariances
         self.log_outlier = [0.0 if outliers is None else b.log_outlier_density(outliers) for b in blocks]
-        groups = [
-            (group.name, w is None) for b, w in zip(blocks, self.whiten, strict=True) for group in b.groups
-        ]
-        self.known = {name: stated[name] for name, own in groups if own and name in stated}
-        self.unknown = sorted({name for name, own in groups if own and name not in stated})
+        sized = [block for block, w in zip(blocks, self.whiten, strict=True) if w is None]
+        groups = [group for block in sized for group in block.groups]
+        self.known = {group.name: stated[group.name] for group in groups if group.name in stated}
+        self.unknown = sorted({group.name for group in groups} - self.known.keys())
+        self.medians = {group.name: group.median for group in groups if group.median is not None}
 
     def linearise(self, values: Array) -> list[Linearised]:
         """Return residuals and Jacobians of all blocks at scaled values."""
@@ -171,15 +172,14 @@ class CalibrationProblem:
         linear: Sequence[Linearised],
         weights: Sequence[Array],
         noise: Mapping[str, float],
-        equations: Weighted,
+        freedom: dict[str, float],
     ) -> dict[str, float]:
-        """Return the sizes of the noise at which weighted residuals have the expected squares."""
-        result = {**noise}
-        if not self.unknown:
-            return result
-        covariance = pseudo_inverse(equations.hessian)[0]
+        """Return the sizes of the noise at which weighted residuals have the expected squares.
+
+        ``freedom`` are the degrees of freedom that the parameters take from each group.
+        """
+        result, freedom = {**noise}, {name: -freedom[name] for name in self.unknown}
         squares = dict.fromkeys(self.unknown, 0.0)
-        freedom = {name: -float(np.sum(covariance * equations.parts[name])) for name in self.unknown}
         for i, one in enumerate(linear):
             if self.whiten[i] is None:
                 for group in self.blocks[i].groups:
@@ -187,37 +187,38 @@ class CalibrationProblem:
                         part = one.residual[:, group.rows]
                         squares[group.name] += float(weights[i] @ np.square(part).sum(axis=1))
                         freedom[group.name] += part.shape[1] * float(weights[i].sum())
-        if min(freedom.values()) < 1.0:
-            # One group has no freedom of its own: all change by one factor.
-            total = sum(squares[name] / noise[name] ** 2 for name in squares)
-            factor = math.sqrt(total / max(sum(freedom.values()), 1.0))
-            return {**result, **{name: max(noise[name] * factor, FINEST) for name in squares}}
         for name in squares:
-            result[name] = max(math.sqrt(squares[name] / freedom[name]), FINEST)
+            size = _likely_size(squares[name], max(freedom[name], 0.0), self.medians.get(name))
+            result[name] = max(size, FINEST)
         return result
 
     # -- solutions ---------------------------------------------------------------------------------------
 
-    def solve(self, start: Array) -> CalibrationFit:
-        """Return the most likely parameters from a start."""
+    def solve(self, start: Array, present: Array) -> CalibrationFit:
+        """Return the most likely parameters from a start; those that nothing tells are the present ones."""
         values, linear = self._approach(start)
-        noise = {**self.median_noise(linear), **self.known}
+        # From above, so that no observation of few is lost at once.
+        noise = {n: max(size, self.medians.get(n, 0.0)) for n, size in self.median_noise(linear).items()}
+        noise |= self.known
         weights, cost = self.mixture(linear, noise)
         for _ in range(_STEPS):
             equations = self.normal_equations(linear, weights, noise)
-            step, _ = gauss_newton_step(equations)
+            covariance, _ = pseudo_inverse(equations.hessian)
+            step = covariance @ equations.gradient
             values, linear, _ = self._descend(values, linear, step, noise, cost)
-            equations = self.normal_equations(linear, weights, noise)
-            before, noise = noise, self.estimate_noise(linear, weights, noise, equations)
+            freedom = {name: float(np.sum(covariance * part)) for name, part in equations.parts.items()}
+            before, noise = noise, self.estimate_noise(linear, weights, noise, freedom)
             weights, cost = self.mixture(linear, noise)
             change = max((abs(noise[n] / before[n] - 1.0) for n in self.unknown), default=0.0)
             if float(step @ equations.hessian @ step) < _SETTLED and change < _EVEN:
                 break
         else:
             raise NoSolutionError(
-                f"The calibration has not converged after {_STEPS} steps. The looks may contradict each "
-                "other, or the present model may be too far away."
+                f"The calibration has not converged after {_STEPS} steps: the looks contradict each other. "
+                "Check the names of joints and frames, the units, and that states and observations belong "
+                "together."
             )
+        values, linear = self._hold_untold(values, linear, weights, noise, present)
         hessian = self.normal_equations(linear, weights, noise).hessian
         return CalibrationFit(values, noise, weights, linear, hessian, pseudo_inverse(hessian)[1])
 
@@ -225,21 +226,41 @@ class CalibrationProblem:
         """Return the parameters from some of the observations, at the weights and the noise of a fit."""
         weights = [w * k for w, k in zip(fit.weights, keep, strict=True)]
         values, linear = fit.values, fit.linear
-        for _ in range(_STEPS):
+        for _ in range(_HALVINGS):
             equations = self.normal_equations(linear, weights, fit.noise)
             step, _ = gauss_newton_step(equations)
             values = values + step
             linear = self.linearise(values)
-            if float(step @ equations.hessian @ step) < 1e-4:  # a hundredth of a standard deviation
+            if float(step @ equations.hessian @ step) < _NEAR:
                 break
         return values
+
+    def _hold_untold(
+        self,
+        values: Array,
+        linear: list[Linearised],
+        weights: Sequence[Array],
+        noise: Mapping[str, float],
+        present: Array,
+    ) -> tuple[Array, list[Linearised]]:
+        """Return values that explain the data alike, without correction in untold directions."""
+        for _ in range(_HALVINGS):
+            equations = self.normal_equations(linear, weights, noise)
+            step, told = gauss_newton_step(equations)
+            untold = values - present - told @ (told.T @ (values - present))
+            # Where a direction is curved, a step of the others follows.
+            if told.shape[1] == len(values) or np.abs([untold, step]).max() < FINEST:
+                break
+            values = values + step - untold
+            linear = self.linearise(values)
+        return values, linear
 
     def _approach(self, values: Array) -> tuple[Array, list[Linearised]]:
         """Go near the solution by Cauchy weights at the scale of the median."""
         linear = self.linearise(values)
         for _ in range(_ROUGH):
             noise = self.median_noise(linear)
-            weights, excess = [], 1.0
+            weights = []
             for i, square in enumerate(self.squares(linear, noise)):
                 size = linear[i].residual.shape[1]
                 if self.whiten[i] is not None:
@@ -249,7 +270,7 @@ class CalibrationProblem:
             step, _ = gauss_newton_step(equations)
             cost = self._rough_cost(linear, noise)
             values, linear, length = self._descend(values, linear, step, noise, cost, rough=True)
-            if float(step @ equations.hessian @ step) * length**2 < 1e-2 * excess:
+            if float(step @ equations.hessian @ step) * length**2 < _NEAR:
                 break
         return values, linear
 
@@ -281,19 +302,42 @@ class CalibrationProblem:
         return values, linear, 0.0
 
 
-def gauss_newton_step(equations: Weighted) -> tuple[Array, int]:
-    """Return the step in the directions that the data tell, and the number of these."""
-    covariance, rank = pseudo_inverse(equations.hessian)
-    return covariance @ equations.gradient, rank
+def gauss_newton_step(equations: Weighted) -> tuple[Array, Array]:
+    """Return the step in the directions that the data tell, and these directions (p, r)."""
+    values, axes = told_directions(equations.hessian)
+    return axes @ (axes.T @ equations.gradient / values), axes
 
 
 def pseudo_inverse(hessian: Array) -> tuple[Array, int]:
-    """Return the inverse of H in the directions told better than the prior size, and their number."""
+    """Return the inverse of H in the directions that the data tell, and their number."""
+    values, axes = told_directions(hessian)
+    return (axes / values) @ axes.T, len(values)
+
+
+def told_directions(hessian: Array) -> tuple[Array, Array]:
+    """Return eigenvalues (r,) and eigenvectors (p, r) of H in directions told better than the prior size."""
     values, axes = np.linalg.eigh(hessian)
-    least = max(1.0, _ROUNDING * len(values) * float(values[-1])) if len(values) else 1.0
-    told = values > least
-    axes = axes[:, told]
-    return (axes / values[told]) @ axes.T, int(told.sum())
+    told = values > max(1.0, _ROUNDING * len(values) * float(values[-1]))
+    return values[told], axes[:, told]
+
+
+def _likely_size(square: float, freedom: float, median: float | None) -> float:
+    """Return the most likely size of noise for a sum of squares with some degrees of freedom.
+
+    Its prior is log-normal around the median. Without it, the size of a group that the parameters can fit
+    exactly, as with few looks, would be zero.
+    """
+    if median is None:
+        return math.sqrt(square / max(freedom, 1.0))
+    variance, log = NOISE_SPREAD**2, math.log(median)
+    for _ in range(_STEPS):
+        # Maximum of -ν log σ - S/(2σ²) - (log σ - log median)²/(2 s²) over log σ, which is concave.
+        pull = square * math.exp(-2.0 * log)
+        step = (pull - freedom - (log - math.log(median)) / variance) / (2.0 * pull + 1.0 / variance)
+        log += max(-1.0, min(step, 1.0))
+        if abs(step) < _EVEN:
+            break
+    return math.exp(log)
 
 
 def _median(size: int) -> float:
