@@ -54,6 +54,7 @@ OPTIONS = ("quick", "seed")
 Mask: TypeAlias = npt.NDArray[np.bool_]
 _STEP = 1e-6  # of differences [m], [rad]
 _FOCAL, _CENTRE = 600.0, (320.0, 240.0)  # of the camera [px]
+_VIEW = (0.45, 0.35)  # tangents of half the angles of view, less what offsets and corners take
 
 
 @dataclass(frozen=True)
@@ -84,7 +85,9 @@ def differences(function: Callable[[Array], Array], at: Array) -> Array:
 def bound_of(jacobian: Array, deviations: Array) -> Array:
     """Return the Cramér-Rao bound of parameters for independent normal errors."""
     scaled = jacobian / deviations[:, None]
-    return np.asarray(np.linalg.inv(scaled.T @ scaled))
+    sizes = np.linalg.norm(scaled, axis=0)  # of pixels and radians
+    triangle = np.linalg.inv(np.linalg.qr(scaled / sizes, mode="r"))
+    return np.asarray(triangle @ triangle.T / np.outer(sizes, sizes))
 
 
 # -- an arm that a camera sees -------------------------------------------------------------------------------
@@ -171,9 +174,15 @@ def arm_model() -> kv.Model:
     return model
 
 
-def draw_joints(rng: np.random.Generator) -> tuple[Array, Array]:
-    """Return joint values (N, 9), and true offsets and mount (13,)."""
-    joints = rng.uniform(_LOWER, _UPPER, (LOOKS, len(_JOINTS)))
+def draw_joints(rng: np.random.Generator, arm: SeenArm) -> tuple[Array, Array]:
+    """Return joint values (N, 9) at which the camera sees the gripper, and true offsets and mount (13,)."""
+    joints = np.empty((0, len(_JOINTS)))
+    while len(joints) < LOOKS:
+        some = rng.uniform(_LOWER, _UPPER, (LOOKS, len(_JOINTS)))
+        places = arm.seen(some, np.zeros(13))[:, :3, 3]
+        is_seen = (places[:, 2] > 0.3) & (np.abs(places[:, :2]) < _VIEW * places[:, 2:]).all(axis=1)
+        joints = np.concatenate([joints, some[is_seen]])
+    joints = joints[:LOOKS]
     sizes = np.concatenate([np.full(7, 0.03), np.full(3, 0.02), np.full(3, 0.05)])
     return joints, sizes * rng.normal(size=13)
 
@@ -185,7 +194,7 @@ def states(joints: Array) -> list[dict[str, float]]:
 def calibrate_arm(model: kv.Model, arm: SeenArm, seed: int, gross: float) -> Draw:
     """Calibrate seven offsets and the mount of the camera by the poses of the gripper."""
     rng = np.random.default_rng([SEED, seed])
-    joints, truth = draw_joints(rng)
+    joints, truth = draw_joints(rng, arm)
     exact = arm.seen(joints, truth)
     wrong = rng.random(LOOKS) < gross
     poses = noisy(rng, exact, wrong)
@@ -216,7 +225,7 @@ def _order(found: Calibration, names: Sequence[str]) -> list[int]:
 def calibrate_camera(model: kv.Model, arm: SeenArm, seed: int) -> Draw:
     """Calibrate focal lengths, centre and mount of the camera by four corners that the gripper holds."""
     rng = np.random.default_rng([SEED, 1, seed])
-    joints, offsets = draw_joints(rng)
+    joints, offsets = draw_joints(rng, arm)
     truth = np.concatenate([[620.0, 610.0, 330.0, 235.0], offsets[7:]])
 
     def image(numbers: Array) -> Array:

@@ -196,6 +196,7 @@ def _difference_of_axes(a: Joint, b: Joint) -> float:
 
 def _check_origin(file: FileContent, tag: str, before: Operation | None, original: Joint) -> None:
     """Check that a joint of the model is where its file has it."""
+    before = before and (before.rebuild() or before)  # an operation of a document
     if not isinstance(before, Joint):
         raise FormatError(f"{file.path.name} is another file: the model lacks its joint '{original.name}'.")
     off = float(np.abs(_origin(before) - _origin(original)).max())
