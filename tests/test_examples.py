@@ -60,6 +60,7 @@ notch at 0.8 m: height 0.755 m, level: True
     "18_reach": "pr2/r_gripper_tool_frame reaches 1.19 m far, ...",
     "19_open_a_door": "pr2 moves 12 joints, ...\nopen by 1.39 rad, ..., none violated",
     "20_plan_a_motion": "8 joints, ... points, ... s\nnothing is nearer than ... mm",
+    "23_learn_a_hinge": "... mm between ...\nx = 301 mm, in truth 300 mm\ny = -201 mm, ...\nroll = 1.5°, in truth 1.5°\npitch = -2.0°, ...",
     "21_live_system": "...joint door is revolute\n...the door is open by 1.2 rad...",
     "22_calibrate": "Calibration of 13 parameters from 30 looks\n...in looks 7\n...7 lines of the URDF are new",
 }
@@ -70,6 +71,7 @@ NEEDED = {
     "19_open_a_door": ("daqp",),
     "20_plan_a_motion": ("coal",),
     "21_live_system": ("zenoh", "daqp", "coal"),
+    "23_learn_a_hinge": ("jax",),
 }
 """The modules that examples need beyond the core."""
 

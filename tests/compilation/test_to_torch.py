@@ -29,6 +29,7 @@ from kineverse.errors import (
     MissingDependencyError,
     ShapeError,
 )
+from markdown_examples import ROOT, examples
 
 pytestmark = pytest.mark.filterwarnings(
     "ignore:`torch.jit.script` is deprecated:FutureWarning"
@@ -191,3 +192,10 @@ def test_wrong_use_is_told(torch: Any) -> None:
         kv.to_torch(A, "a")
     with pytest.raises(InvalidValueError, match="Unknown tier"):
         kv.to_torch(A, [A], tier="cuda")  # type: ignore[arg-type]
+
+
+def test_the_example_on_the_page_runs(torch: Any) -> None:
+    blocks = list(examples(ROOT / "docs" / "learning.md", "py"))
+    assert blocks
+    for block in blocks:
+        exec(block.code, {})

@@ -204,8 +204,7 @@ def _in_c(
 
     def call(x: Any) -> list[Any]:
         results = [jax.ShapeDtypeStruct((*x.shape[:-1], *shape), x.dtype) for shape in shapes]
-        values: list[Any] = jax.ffi.ffi_call(name, results, vmap_method="broadcast_all")(x)
-        return values
+        return list(jax.ffi.ffi_call(name, results, vmap_method="broadcast_all")(x))
 
     return call
 

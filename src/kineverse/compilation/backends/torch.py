@@ -6,6 +6,7 @@ of operations of PyTorch. Derivatives are further programs in both cases.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Sequence
 from functools import cache
 from typing import Any, Literal
@@ -145,11 +146,11 @@ def _differentiable(
         def backward(ctx: Any, *weights: Any) -> Any:
             (x,) = ctx.saved_tensors
             slopes = following().apply(x)[count:]
-            terms = []
-            for shape, slope, weight in zip(shapes, slopes, weights, strict=True):
-                if weight is not None:
-                    product = slope * weight.unsqueeze(-1)
-                    terms.append(product.sum(tuple(range(-1 - len(shape), -1))) if shape else product)
+            terms = [
+                (weight.reshape((*x.shape[:-1], 1, math.prod(shape))) @ _matrix(slope, x)).squeeze(-2)
+                for shape, slope, weight in zip(shapes, slopes, weights, strict=True)
+                if weight is not None
+            ]
             return sum(terms[1:], terms[0]) if terms else None
 
         @staticmethod
@@ -157,7 +158,7 @@ def _differentiable(
             (x,) = ctx.saved_tensors
             slopes = following().apply(x)[count:]
             return tuple(
-                (slope * v.reshape((*v.shape[:-1], *(1,) * len(shape), v.shape[-1]))).sum(-1)
+                (_matrix(slope, x) @ v.unsqueeze(-1)).reshape((*x.shape[:-1], *shape))
                 for shape, slope in zip(shapes, slopes, strict=True)
             )
 
@@ -167,6 +168,12 @@ def _differentiable(
             return results, (0,) * len(results)
 
     return Evaluate
+
+
+def _matrix(slope: Any, x: Any) -> Any:
+    """Return derivatives with one row for each element of the output."""
+    count = math.prod(slope.shape[x.ndim - 1 : -1])
+    return slope.reshape((*x.shape[:-1], count, x.shape[-1]))
 
 
 def _in_operations(program: Program, shapes: tuple[ArrayShape, ...]) -> Callable[[Any], list[Any]]:
