@@ -35,6 +35,9 @@ is read back before it becomes OUT. It is written whole or not at all, and repla
 If OUT is a dash, a document goes to standard output. From URDF to URDF, names of materials and elements such
 as <transmission> and <gazebo> are kept.
 
+USD (.usda, .usdc, .usd) holds the document of the model beside joints for other tools, so nothing is
+refused unless --strict is given; needs the extra usd.
+
 Mesh files are not copied; OUT refers to them by paths that are valid from its folder. Meshes that MuJoCo
 cannot read are converted, into a folder beside OUT; missing ones are left out of MJCF.
 
@@ -50,6 +53,7 @@ examples:
   kineverse convert live:home home.kv.json
   kineverse convert kitchen - | gzip > kitchen.kv.json.gz
   kineverse convert pr2 pr2.xml
+  kineverse convert pr2 pr2.usda
   kineverse convert garage.kv.json garage.urdf --strict --leave-out garage/lock
   kineverse convert articulations/pedal_bin bin.xml --tolerance 0.01"""
 

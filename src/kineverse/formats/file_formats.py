@@ -7,6 +7,7 @@ from kineverse.model.registry import FileFormat
 from .xml_reader import read_root_tag
 
 DOCUMENT_SUFFIXES = (".kv.json", ".kv.msgpack")
+USD_SUFFIXES = (".usda", ".usdc", ".usd")
 
 
 def is_mjcf(name: str, content: bytes) -> bool:
@@ -62,6 +63,22 @@ def list_file_formats() -> tuple[FileFormat, ...]:
             engine=f"{formats}.engines:DrakeEngine",
             loop_element="joint",
             reference=b"include",
+        ),
+        FileFormat(
+            name="USD",
+            suffixes=USD_SUFFIXES,
+            read=f"{formats}.usd.operations:usd_file_operations",
+            written=USD_SUFFIXES,
+            write=f"{formats}.usd.writer:to_usd",
+            engine=f"{formats}.usd.kinematics:UsdEngine",
+            loop_element="joint",
+        ),
+        FileFormat(
+            name="PartNet-Mobility",
+            suffixes=("mobility_v2.json",),
+            read=f"{formats}.partnet.operations:partnet_file_operations",
+            folder_file="mobility_v2.json",
+            reference=b"[",  # meshes are named by result.json beside it
         ),
         FileFormat(
             name="xacro",

@@ -145,7 +145,9 @@ _UNIT_COEFFICIENTS = (IDENTITY_COEFFICIENTS, (0.0, -1.0))
 class LinkTreeBuilder:
     """Builder of the robot description of one model.
 
-    With ``loose``, frames that the format cannot move are loose links, and each link is a frame.
+    With ``loose``, frames that the format cannot move are loose links. With ``carriers``, by default unless
+    ``loose``, coordinates that are the position of no joint have a link of their own; else each link is a
+    frame.
     """
 
     def __init__(
@@ -156,9 +158,11 @@ class LinkTreeBuilder:
         tolerance: float | None = None,
         strict: bool = False,
         loose: bool = False,
+        carriers: bool | None = None,
     ) -> None:
         self.model, self.capabilities = model, target
         self._loose = loose
+        self._carriers = not loose if carriers is None else carriers
         self.unsupported = UnsupportedFeatures(target.name, strict)
         self.remarks: list[str] = []
         # Symbols of refused frames: their limits are not reported a second time.
@@ -200,7 +204,7 @@ class LinkTreeBuilder:
             for name in names
             if name in chains or self._loose
         ]
-        if not self._loose:
+        if self._carriers:
             links += self._carrier_links(chains, set(independent), links)
         description = RobotDescription(links, self.model.bodies.get(WORLD, NO_BODY), loops=self._loops)
         simple = list(self._expressible_constraints(found, approximation))
@@ -299,11 +303,12 @@ class LinkTreeBuilder:
         return result
 
     def _refuse(self, name: str, factors: Iterable[Pose | Expression], problem: str) -> None:
+        if self._loose:
+            return
         symbols = dict.fromkeys(s for f in factors if isinstance(f, Expression) for s in f.symbols)
         self._refused_symbols.update(symbols)
         moves = f"it moves with {', '.join(map(str, symbols))}" if symbols else "loops hold it where it is"
-        if not self._loose:
-            self.unsupported.refuse(name, f"{problem}; {moves}")
+        self.unsupported.refuse(name, f"{problem}; {moves}")
 
     def _factor(self, factor: Pose | Expression) -> Pose | Expression:
         if isinstance(factor, Pose):

@@ -52,7 +52,7 @@ class SdfBodyWriter:
                 element = link.add(tag, name=own)
                 if own != shape.name:
                     element.attributes[NAME] = shape.name
-                add_pose_element(element, shape.origin.matrix)
+                add_sdf_pose(element, shape.origin.matrix)
                 self._geometry(element.add("geometry"), shape.geometry)
                 self._material(element, shape, name)
 
@@ -71,7 +71,7 @@ class SdfBodyWriter:
         if inertia is None:
             element.attributes[INERTIA] = ""
         else:
-            add_pose_element(element, inertia.origin.matrix)
+            add_sdf_pose(element, inertia.origin.matrix)
             mass = inertia.mass if inertia.mass > 0 else _MASS
             tensor = inertia.tensor if _is_physical(inertia) else _of_sphere(inertia)
             if (mass, tensor) != (inertia.mass, inertia.tensor):
@@ -120,7 +120,7 @@ class SdfBodyWriter:
             self._remarks.append(text)
 
 
-def add_pose_element(element: Tag, pose: Matrix, relative_to: str | None = None) -> None:
+def add_sdf_pose(element: Tag, pose: Matrix, relative_to: str | None = None) -> None:
     """Add the ``<pose>`` of an element, unless it is the identity where poses are by default."""
     numbers = (*pose[:3, 3].tolist(), *rpy_angles(pose))
     if any(numbers) or relative_to:

@@ -40,7 +40,7 @@ from kineverse.model.frame import WORLD
 from kineverse.model.model_view import ModelView
 from kineverse.symbols import parse_symbol_name
 
-from .body_writer import SdfBodyWriter, add_pose_element
+from .body_writer import SdfBodyWriter, add_sdf_pose
 from .custom_attributes import FREE, HOME, LOOP, NAME, NAMESPACE, PREFIX, ZERO, SdfLoop, joint_motion
 
 SDF_CAPABILITIES = FormatCapabilities("SDF", loop_joints=True)
@@ -208,7 +208,7 @@ class SdfWriter:
         element = self._model.add("link", name=name)
         if name != frame:
             element.attributes[NAME] = frame
-        add_pose_element(element, pose, None if parent == WORLD else parent)
+        add_sdf_pose(element, pose, None if parent == WORLD else parent)
         return element
 
     def _fixed(self, link: LinkDescription) -> None:
@@ -217,7 +217,7 @@ class SdfWriter:
             element = self._model.add("frame", name=name, attached_to=parent)
             if name != link.name:
                 element.attributes[NAME] = link.name
-            add_pose_element(element, link.pose)
+            add_sdf_pose(element, link.pose)
             return
         element = self._add_link(link.name, name, link.pose, parent)
         self._bodies.write(element, link.body, link.name)
@@ -270,7 +270,7 @@ class SdfWriter:
         if home:
             element.attributes[HOME] = format_numbers(home)
         if any(joint.point):
-            add_pose_element(element, translation(np.array(joint.point)))
+            add_sdf_pose(element, translation(np.array(joint.point)))
         shift = zero[0] if len(zero) == 1 else 0.0
         for tag, axis in zip(("axis", "axis2"), joint.axes, strict=False):
             self._axis(element.add(tag), axis, shift)

@@ -74,7 +74,7 @@ def urdf_operations(
     robot: UrdfRobot, prefix: str | None = None, parent: str = WORLD, strict: bool = False
 ) -> Iterator[Operation]:
     """Yield the operations that build a robot, from its root outwards."""
-    links, joints = _assign_names(robot, prefix, strict)
+    links, joints = assign_names(robot, prefix, strict)
 
     def frame_name(name: str) -> str:
         return f"{prefix}/{links[name]}" if prefix else links[name]
@@ -149,9 +149,7 @@ def _dynamics(joint: UrdfJoint) -> tuple[tuple[str, float], ...]:
     return tuple((name, value) for name, value in values.items() if value is not None)
 
 
-def _assign_names(
-    robot: UrdfRobot, prefix: str | None, strict: bool
-) -> tuple[dict[str, str], dict[str, str]]:
+def assign_names(robot: UrdfRobot, prefix: str | None, strict: bool) -> tuple[dict[str, str], dict[str, str]]:
     """Return the names of links and joints in the model; invalid and repeated names are replaced."""
     numbers = NumberedNames()
 
