@@ -222,7 +222,7 @@ def test_a_copy_in_another_form_and_a_light_beside_change_nothing(written: Path,
     def add_light(stage: Usd.Stage) -> None:
         UsdLux.DistantLight.Define(stage, "/light")
 
-    for ending in (".usdc", ".usd", ".usda"):
+    for ending in (".usdc", ".usda"):
         copy = edit_stage(written, add_light, tmp_path / f"copy{ending}")
         again, remarks = load(copy)
         assert document_hash(again) == before
@@ -292,6 +292,31 @@ def test_the_scale_of_a_body_scales_the_places_of_its_joints(tmp_path: Path) -> 
     joint.CreateLocalPos1Attr((0.25, 0.0, 0.0))
     model, _ = load(arm.save(tmp_path / "arm.usda"))
     assert np.allclose(model.fk("big", "far")({}), kv.translation(-0.5, 0, 0)({}), atol=CLOSE)
+
+
+def test_values_of_a_wrong_type_are_refused_or_left_out(tmp_path: Path) -> None:
+    arm = Arm()
+    UsdGeom.Sphere.Define(arm.stage, "/arm/far/ball").CreateRadiusAttr(0.5)
+    text = arm.stage.GetRootLayer().ExportToString()
+    file = tmp_path / "arm.usda"
+    file.write_text(text.replace("double radius = 0.5", 'string radius = "big"'))
+    model, remarks = load(file)
+    assert "far" not in model.bodies
+    assert "/arm/far/ball has a size that is none" in remarks[0]
+    file.write_text(
+        text.replace("matrix4d xformOp:transform = (", "double3 xformOp:transform = (0, 0, 0) #", 1)
+    )
+    with pytest.raises(FormatError, match="no USD that can be read"):
+        kv.load(file)
+
+
+def test_a_mirrored_cone_points_the_other_way(tmp_path: Path) -> None:
+    arm = Arm()
+    cone = UsdGeom.Cone.Define(arm.stage, "/arm/far/cone")
+    cone.AddScaleOp().Set((1.0, 1.0, -1.0))
+    model, _ = load(arm.save(tmp_path / "arm.usda"))
+    (shape,) = model.bodies["far"].visuals
+    assert np.allclose(shape.origin.matrix[:3, 2], (0.0, 0.0, -1.0))
 
 
 def test_joints_may_lead_inwards(tmp_path: Path) -> None:
