@@ -1,6 +1,7 @@
 """Strings that documents have for classes stay what they are, and with them the digests of models.
 
-``digests.json`` has the digests of models as they were before the classes were renamed. ``exact`` has those
+``digests.json`` has the digests of models as they were before the classes were renamed, and with the datum of
+what a URDF says besides since then. ``exact`` has those
 whose numbers come from Python's arithmetic and the C library; they came out equal with every kernel of OpenBLAS
 (``OPENBLAS_CORETYPE=Prescott`` to ``SkylakeX``), without FMA in the C library and without AVX in numpy. The
 scenes in :data:`SOLVED` have numbers that LAPACK or BLAS computes, whose last bits depend on the processor;

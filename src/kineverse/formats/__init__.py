@@ -7,6 +7,7 @@ from kineverse._lazy import lazy_face
 if TYPE_CHECKING:
     from kineverse.formats import urdf as urdf
 
+    from .conversion_check import ConversionCheck as ConversionCheck, check_conversion as check_conversion
     from .document import (
         document_hash as document_hash,
         entries_from_bytes as entries_from_bytes,

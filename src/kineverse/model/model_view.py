@@ -22,7 +22,7 @@ from kineverse.symbols import Symbol, check_symbols, parse_symbol_name
 from . import registry
 from .constraint import TOLERANCE, Constraint, ConstraintLike, as_constraint
 from .operation import ARTICULATIONS, CONSTRAINTS, map_expressions
-from .registry import SaveResult
+from .registry import SaveResult, SourceFile
 from .symbolic_view import SymbolicView, cached_for_version
 
 if TYPE_CHECKING:
@@ -41,6 +41,13 @@ class ModelView(SymbolicView):
 
     This class adds the queries that take or return numbers to those of :class:`SymbolicView`.
     """
+
+    _sources: tuple[SourceFile, ...] = ()
+
+    @property
+    def sources(self) -> tuple[SourceFile, ...]:
+        """Files that the model was loaded from, or that were included in it."""
+        return self._sources
 
     # -- constraints ---------------------------------------------------------------------------------------
 

@@ -51,6 +51,16 @@ class FileContent(Struct, frozen=True):
     arguments: Mapping[str, str] = field(default_factory=dict)  # arguments of a template, by name
 
 
+class SourceFile(Struct, frozen=True):
+    """File that a model was loaded from, and how it was read."""
+
+    path: Path
+    digest: bytes  # BLAKE2b of its bytes
+    prefix: str | None = None  # prefix of all names
+    root: str = ""  # folder below which it opened further files
+    shipped: str | None = None  # name of the model if it comes with the package
+
+
 class FileFormat(Struct, frozen=True):
     """File format of models, with its reader and its writer."""
 
@@ -62,6 +72,7 @@ class FileFormat(Struct, frozen=True):
     recognize: Callable[[str, bytes], bool] | None = None  # of (name, content), where formats share a suffix
     exact: bool = False  # True if files hold all of a model; then write is a function of (model, path)
     folder_file: str = ""  # name of the file that stands for its folder; empty if none does
+    engine: str = ""  # class that reads files of the format on its own, to compare poses; empty for none
     loop_element: str = ""  # element of the format that closes a loop; empty if the format has none
     reference: bytes = b""  # text in every file that refers to further files; empty if files never do
 
