@@ -295,8 +295,9 @@ def _swallowed(part: MovingPart, sweep: Sweep, body: str, share: float, state: S
     kind = "no_limits" if np.isinf(part.limits[at > part.home]) else "into_carrier"
     if kind == "into_carrier" and sweep.find_swallowing_body(mirrored=True) is None:
         kind, text = "flipped_axis", f"{text}; the other way it is free"
-    more = {"value": share, "limit": SWALLOWED, "unit": "1"}
-    return _entry(part, kind, "suspect", text, **more, state=state, against=body)
+    return _entry(
+        part, kind, "suspect", text, value=share, limit=SWALLOWED, unit="1", state=state, against=body
+    )
 
 
 def _explain(part: MovingPart, sweep: Sweep) -> tuple[str, str] | None:
