@@ -103,11 +103,19 @@ def run(arguments: argparse.Namespace) -> int:
     motions = [check_result(result, arguments.pictures) for result in results] if arguments.motion else []
     if motions:
         results = [_without_inertia(result) for result in results]
-    findings = any(motion is not None and not motion.report.ok for motion in motions)
-    status = max(*(result.status for result in results), INVALID if findings else VALID)
+    statuses = [result.status for result in results]
+    for k, motion in enumerate(motions):
+        statuses[k] = max(statuses[k], VALID if motion is None or motion.report.ok else INVALID)
+    status = max(statuses)
     most = None if arguments.all else SHOWN if len(results) == 1 else SHOWN_OF_SEVERAL
     if arguments.json:
-        answer = {"status": status, "files": [validation_to_json(result) for result in results]}
+        answer = {
+            "status": status,
+            "files": [
+                validation_to_json(result) | {"status": one}
+                for result, one in zip(results, statuses, strict=True)
+            ],
+        }
         print(json.dumps(answer | motions_to_json(results, motions), allow_nan=False))
     elif len(results) > 1:
         details = [format_validation(result, most) for result in results if result.status]

@@ -56,13 +56,7 @@ class PartNetPart:
 
 
 def read_partnet(content: bytes, path: Path) -> list[PartNetPart]:
-    """Return the parts of a file, parents first, without junk; the meshes are found beside the file.
-
-    Raises
-    ------
-    FormatError
-        If the file is no such description; the message names the part and the reason.
-    """
+    """Return the parts of a file, parents first, without junk; the meshes are found beside the file."""
     source = path.name
     entries = _parse(content, source)
     if not isinstance(entries, list) or not entries:

@@ -15,7 +15,7 @@ from kineverse.geometry.shapes import Solid, solid_from_geometry
 from kineverse.lie import rotation_along_z
 from kineverse.model.body import Shape
 
-DIRECTIONS = 180  # directions in which a line is looked at from a part: a step of 2° errs by 0.02 %
+DIRECTIONS, ROUNDS = 61, 4  # directions of a round: each divides the step by 30, the last is 0.2 µrad
 
 
 class PartShape:
@@ -65,11 +65,15 @@ class PartShape:
     def distance_to_line(self, point: Floats, direction: Floats) -> float:
         """Return the distance of a line from the hull [m]; 0 if it passes through.
 
-        It is the widest gap between the line and the hull over all directions across the line.
+        It is the widest gap between the line and the hull over all directions across the line. That is
+        searched in a circle, then around the best direction.
         """
         across = (self.points - point) @ rotation_along_z(direction)[:, :2]
-        angles = np.linspace(0.0, 2.0 * math.pi, DIRECTIONS, endpoint=False)
-        gaps = (np.stack([np.cos(angles), np.sin(angles)]).T @ across.T).min(axis=1)
+        best, step = 0.0, math.pi
+        for _ in range(ROUNDS):
+            angles = best + np.linspace(-step, step, DIRECTIONS)
+            gaps = (np.stack([np.cos(angles), np.sin(angles)]).T @ across.T).min(axis=1)
+            best, step = float(angles[np.argmax(gaps)]), 2.0 * step / (DIRECTIONS - 1)
         return max(0.0, float(gaps.max()))
 
     def moved(self, pose: Floats) -> PartShape:

@@ -6,7 +6,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal, TypeAlias
 
+from kineverse.errors import UnknownNameError, suggest
 from kineverse.expressions.printing import format_number
+from kineverse.symbols import Symbol
 
 Severity: TypeAlias = Literal["finding", "suspect", "cannot_say"]
 """A finding is certainly wrong, a suspect is worth a look, and what cannot be said lacks something."""
@@ -178,9 +180,13 @@ class MotionReport:
         """All suspects."""
         return tuple(entry for report in self.all for entry in report.suspects)
 
-    def __getitem__(self, name: str) -> CoordinateReport:
-        """Return the report of a coordinate by its name."""
-        return next(report for report in self.coordinates if report.name == str(name))
+    def __getitem__(self, name: Symbol | str) -> CoordinateReport:
+        """Return the report of a coordinate."""
+        known = {report.name: report for report in self.coordinates}
+        if str(name) not in known:
+            hint = suggest(str(name), known, "coordinate")
+            raise UnknownNameError(f"There is no coordinate '{name}'. {hint}")
+        return known[str(name)]
 
 
 def format_length(length: float) -> str:

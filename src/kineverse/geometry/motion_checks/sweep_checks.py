@@ -16,6 +16,7 @@ from kineverse.geometry.collision_filter import Rule
 from kineverse.geometry.mesh_files import Floats
 from kineverse.geometry.objects import collision_shapes
 from kineverse.geometry.scene import Scene
+from kineverse.geometry.shapes import sample_inside
 from kineverse.lie import inverse, rotation_along_z, transform
 from kineverse.model.body import Body, Mesh, Pose
 from kineverse.model.model import Model
@@ -47,6 +48,14 @@ Shapes that overlap at rest are coarse, or one slides in the other, as a bolt do
 
 DEEPER, LEAST_DEEPER = 0.15, 0.01
 """Further depth that is a suspect whatever the depth at rest, in sizes of the part, and at least [m]."""
+
+SWALLOWED, OUTSIDE_AT_REST = 0.3, 0.1
+"""Share of a hinged part in the hull of what it hangs on that is a suspect, if its share at rest is less.
+
+A cupboard is hollow, so a door that opens inwards may touch nothing in it.
+"""
+
+SAMPLES = 200  # points of a part whose places in a hull are looked at
 
 _EVERYTHING = Rule("*", "*", True)
 
@@ -153,6 +162,32 @@ class Sweep:
             for body in other.bodies
         }
 
+    def find_swallowing_body(self, mirrored: bool = False) -> tuple[str, float, State] | None:
+        """Return a body in whose hull a hinged part turns from outside, the share of it, and the state."""
+        part, parts = self.part, self.part.parts
+        hull = part.shape.hull
+        axis = part.fixed_axis
+        if hull is None or axis is None or not axis.turn or part.is_robot_link:
+            return None
+        points = sample_inside(hull.points, hull.triangles, hull.points.mean(axis=0), SAMPLES)
+        rest = inverse(parts.group_pose(part.group))
+        local = points @ rest[:3, :3].T + rest[:3, 3]
+        carrier = parts.group_pose(part.carrier)
+        best: tuple[str, float, State] | None = None
+        for body in sorted({other for _, other in self._rests} & set(part.carrier.bodies)):
+            around = parts.shape_of([body]).hull
+            if around is None or (around.face_distances(points) < 0.0).mean() > OUTSIDE_AT_REST:
+                continue
+            for state in part.states(mirrored):
+                try:
+                    pose = carrier @ parts.groups.pose(part.group, state)
+                except NoSolutionError:
+                    continue
+                share = float((around.face_distances(local @ pose[:3, :3].T + pose[:3, 3]) < 0.0).mean())
+                if share > max(SWALLOWED, best[1] if best else 0.0):
+                    best = body, share, state
+        return best
+
     def is_confirmed(self, overlap: SweptOverlap) -> bool:
         """Return True if the surfaces of meshes overlap too, whose hulls do.
 
@@ -195,6 +230,8 @@ def check_sweep(part: MovingPart) -> Iterator[MotionFinding]:
     loose = sweep.loose_state()
     if overlap is not None:
         yield _entering(part, sweep, overlap)
+    elif (swallowed := sweep.find_swallowing_body()) is not None:
+        yield _swallowed(part, sweep, *swallowed)
     elif loose is not None:
         text = f"leaves everything that it is near at rest, by more than {format_length(sweep.reach)}"
         yield _entry(part, "comes_apart", "suspect", text, limit=sweep.reach, unit="m", state=loose)
@@ -249,6 +286,17 @@ def _entering(part: MovingPart, sweep: Sweep, overlap: SweptOverlap) -> MotionFi
         unit="m",
         state=overlap.state,
         against=overlap.bodies[1],
+    )
+
+
+def _swallowed(part: MovingPart, sweep: Sweep, body: str, share: float, state: State) -> MotionFinding:
+    text = f"turns into '{body}', in whose hull {format_number(100 * share, 2)} % of it end"
+    at = state[part.coordinate]
+    kind = "no_limits" if np.isinf(part.limits[at > part.home]) else "into_carrier"
+    if kind == "into_carrier" and sweep.find_swallowing_body(mirrored=True) is None:
+        kind, text = "flipped_axis", f"{text}; the other way it is free"
+    return _entry(
+        part, kind, "suspect", text, value=share, limit=SWALLOWED, unit="1", state=state, against=body
     )
 
 
