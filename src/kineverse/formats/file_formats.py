@@ -65,16 +65,6 @@ def list_file_formats() -> tuple[FileFormat, ...]:
             reference=b"include",
         ),
         FileFormat(
-<<<<<<< HEAD
-=======
-            name="PartNet-Mobility",
-            suffixes=("mobility_v2.json",),
-            read=f"{formats}.partnet.operations:partnet_file_operations",
-            folder_file="mobility_v2.json",
-            reference=b"[",  # meshes are named by result.json beside it
-        ),
-        FileFormat(
->>>>>>> w-checks
             name="USD",
             suffixes=USD_SUFFIXES,
             read=f"{formats}.usd.operations:usd_file_operations",
@@ -82,7 +72,6 @@ def list_file_formats() -> tuple[FileFormat, ...]:
             write=f"{formats}.usd.writer:to_usd",
             engine=f"{formats}.usd.kinematics:UsdEngine",
             loop_element="joint",
-<<<<<<< HEAD
         ),
         FileFormat(
             name="PartNet-Mobility",
@@ -90,8 +79,6 @@ def list_file_formats() -> tuple[FileFormat, ...]:
             read=f"{formats}.partnet.operations:partnet_file_operations",
             folder_file="mobility_v2.json",
             reference=b"[",  # meshes are named by result.json beside it
-=======
->>>>>>> w-checks
         ),
         FileFormat(
             name="xacro",

@@ -71,13 +71,8 @@ class FileFormat(Struct, frozen=True):
     write: str = ""  # function of (model, path, leave_out, tolerance, strict) to the content of files
     recognize: Callable[[str, bytes], bool] | None = None  # of (name, content), where formats share a suffix
     exact: bool = False  # True if files hold all of a model; then write is a function of (model, path)
-<<<<<<< HEAD
     engine: str = ""  # class that reads files of the format on its own, to compare poses; empty for none
     folder_file: str = ""  # name of the file that stands for its folder; empty if none does
-=======
-    folder_file: str = ""  # name of the file that stands for its folder; empty if none does
-    engine: str = ""  # class that reads files of the format on its own, to compare poses; empty for none
->>>>>>> w-checks
     loop_element: str = ""  # element of the format that closes a loop; empty if the format has none
     reference: bytes = b""  # text in every file that refers to further files; empty if files never do
 
