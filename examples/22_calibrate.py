@@ -14,7 +14,15 @@ import kineverse as kv
 from kineverse import lie
 from kineverse.estimation import calibrate
 
-ARM = ("shoulder_pan", "shoulder_lift", "upper_arm_roll", "elbow_flex", "forearm_roll", "wrist_flex", "wrist_roll")
+ARM = (
+    "shoulder_pan",
+    "shoulder_lift",
+    "upper_arm_roll",
+    "elbow_flex",
+    "forearm_roll",
+    "wrist_flex",
+    "wrist_roll",
+)
 JOINTS = (*(f"pr2/r_{name}_joint" for name in ARM), "pr2/head_pan_joint", "pr2/head_tilt_joint")
 LOWER = [-1.5, -0.4, -2.0, -2.0, -2.0, -1.8, -2.0, -0.6, 0.1]
 UPPER = [0.4, 0.8, 0.5, -0.3, 2.0, -0.2, 2.0, 0.6, 0.9]

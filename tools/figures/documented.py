@@ -467,6 +467,37 @@ DEPLOYMENT = (
     ),
 )
 
+_CONVERSION = "kineverse reproduce conversion"
+_ROBOTS = Unchecked("the short form has few models, and other versions of engines may be installed")
+
+CONVERSION = (
+    DocumentedTable(
+        "conversion-engines",
+        "export.md",
+        _CONVERSION,
+        "Engines",
+        {
+            "format": KEY,
+            "engine": _ROBOTS,
+            "files": _ROBOTS,
+            "all equal": SAME,
+            "refused": _ROBOTS,
+            "largest distance [m]": EXTREME,
+            "largest angle [rad]": EXTREME,
+        },
+        short_forms.conversion,
+    ),
+    DocumentedTable(
+        "conversion-models",
+        "export.md",
+        _CONVERSION,
+        "Models in each format",
+        {"model": KEY, **dict.fromkeys(("frames", "DoF", "URDF", "MJCF", "SDF"), SAME)},
+        short_forms.conversion,
+        has_all_rows=False,
+    ),
+)
+
 _CALIBRATION = "kineverse reproduce calibration"
 # Spreads of a root mean square over the parameters of a draw, which are correlated: measured. Errors of a
 # hand-eye calibration have long tails, those of OpenCV's above all.
@@ -507,5 +538,8 @@ CALIBRATION = (
     ),
 )
 
-DOCUMENTED = (*FIG4, *STURM, *STREAM, *JOINTS, *CALIBRATION, *MANIPULATION, *LOCKBOX, *BENCH, *DEPLOYMENT)
+DOCUMENTED = (
+    *(*FIG4, *STURM, *STREAM, *JOINTS, *CALIBRATION, *MANIPULATION, *LOCKBOX, *BENCH, *DEPLOYMENT),
+    *CONVERSION,
+)
 """All tables, in the order of the pages."""

@@ -158,6 +158,14 @@ def joint_types() -> Tables:
 
 
 @cache
+def conversion() -> Tables:
+    """Write and check a few of the models."""
+    from kineverse_studies.experiments import Options, reproduce
+
+    return as_tables(reproduce("conversion", options=Options(quick=True, processes=1)))
+
+
+@cache
 def estimation_grid() -> Tables:
     """Fit few samples of each cell."""
     from kineverse_studies.experiments import Options

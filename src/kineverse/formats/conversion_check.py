@@ -20,6 +20,7 @@ from kineverse.model.sampling import StateSamples
 from .engines import PoseEngine
 from .export.link_tree import sort_parents_first
 
+EQUAL = 1e-9  # largest difference of a pose [m], [rad] that counts as rounding
 STATES = 100
 
 
@@ -74,8 +75,7 @@ def check_conversion(
     """Compare the poses of all frames of a model with those of a file, in an engine of its own.
 
     The engine is pinocchio for URDF, MuJoCo for MJCF and drake for SDF. It reads the file with its own
-    parser, and gets the values of all coordinates in each state, of dependent ones as well. OpenUSD reads
-    USD and has no kinematics: they are those of :func:`kineverse.formats.usd.stage_poses`.
+    parser, and gets the values of all coordinates in each state, of dependent ones as well.
 
     Parameters
     ----------
@@ -83,7 +83,7 @@ def check_conversion(
         Number of states: the default state, and random ones within limits, the same in every call.
     bounds
         Allowed differences of approximated frames [m], [rad], as in ``errors`` of the result of a save; other
-        frames may differ by 1e-9, those of USD by 1e-6.
+        frames may differ by 1e-9.
 
     Raises
     ------
@@ -107,15 +107,14 @@ def check_conversion(
     for state, expected in zip(values, poses, strict=True):
         found = engine.poses(state)[chosen]
         distance = np.maximum(distance, np.linalg.norm(found[:, :3, 3] - expected[:, :3, 3], axis=1))
-        angle = np.maximum(angle, rotation_angle(found[:, :3, :3].swapaxes(1, 2) @ expected[:, :3, :3]))
+        turned = np.swapaxes(found[:, :3, :3], 1, 2) @ expected[:, :3, :3]
+        angle = np.maximum(angle, rotation_angle(turned))
     errors = {
         name: FrameDeviation(float(p), float(a)) for name, p, a in zip(names, distance, angle, strict=True)
     }
     allowed = dict(bounds or {})
-    wrong = {
-        name: error for name, error in errors.items() if _exceeds(error, allowed.get(name), engine.equal)
-    }
-    gaps = {name: gap for name, gap in engine.closures().items() if _exceeds(gap, None, engine.equal)}
+    wrong = {name: error for name, error in errors.items() if _exceeds(error, allowed.get(name))}
+    gaps = {name: gap for name, gap in engine.closures().items() if _exceeds(gap, None)}
     joints = {record.child: name for name, record in model.articulations.items()}
     worst = max(errors, key=lambda name: max(errors[name].position, errors[name].angle), default="")
     first = next(iter(wrong), "")
@@ -134,9 +133,9 @@ def check_conversion(
     )
 
 
-def _exceeds(error: FrameDeviation, bound: FrameDeviation | None, equal: float) -> bool:
+def _exceeds(error: FrameDeviation, bound: FrameDeviation | None) -> bool:
     """Return whether an error is above its bound; one that is no number is."""
-    position, angle = (equal, equal) if bound is None else (bound.position + equal, bound.angle + equal)
+    position, angle = (EQUAL, EQUAL) if bound is None else (bound.position + EQUAL, bound.angle + EQUAL)
     return not (error.position <= position and error.angle <= angle)
 
 

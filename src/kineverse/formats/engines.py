@@ -42,7 +42,6 @@ class PoseEngine(ABC):
 
     package: ClassVar[str]  # name of its package in Python
     distribution: ClassVar[str]  # name under which it is installed
-    equal: ClassVar[float] = 1e-9  # largest difference of a pose [m], [rad] that counts as rounding
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -323,7 +322,8 @@ class DrakeEngine(PoseEngine):
         for joint in self._loops:
             ends = [joint.findtext(role, "") for role in ("parent", "child")]
             a, b = (np.eye(4) if end == "world" else self._pose(end) for end in ends)
-            angle = 0.0 if joint.get("type") == "ball" else rotation_angle(a[:3, :3].T @ b[:3, :3])
+            turned = rotation_angle(a[:3, :3].T @ b[:3, :3])
+            angle = 0.0 if joint.get("type") == "ball" else float(turned)
             found[joint.get("name", "")] = FrameDeviation(
                 float(np.linalg.norm(a[:3, 3] - b[:3, 3])), float(angle)
             )
