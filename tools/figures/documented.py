@@ -512,7 +512,7 @@ CALIBRATION = (
         _CALIBRATION,
         "Pose of a camera",
         {
-            "looks": KEY,
+            "looks, spread": KEY,
             "error": KEY,
             "ours": _HAND_EYE,
             **dict.fromkeys(("Tsai", "Park", "Horaud"), _HAND_EYE),

@@ -285,7 +285,7 @@ class WheelSpeeds:
         return np.asarray(5.0 * times[:, None] + waves.sum(axis=2))
 
 
-def drive(speeds: WheelSpeeds, wheels: Array, start: Array, at: Array) -> Array:
+def integrate_drive(speeds: WheelSpeeds, wheels: Array, start: Array, at: Array) -> Array:
     """Return x, y, angle and wheel angles (N, 5) at some times.
 
     The angles of the wheels, and with them that of the base, are known in closed form. Its position is
@@ -321,8 +321,8 @@ def calibrate_wheels(model: kv.Model, seed: int, slips: int, gross: float) -> Dr
     start = rng.normal(size=3)
     times, seen_at = np.arange(0.0, _SECONDS, _READING), np.arange(0.3, _SECONDS - 0.1, _SEEN)
     wheels = _WHEELS + changes
-    angles = drive(speeds, wheels, start, times)[:, 3:]
-    x, y, angle = drive(speeds, wheels, start, seen_at)[:, :3].T
+    angles = integrate_drive(speeds, wheels, start, times)[:, 3:]
+    x, y, angle = integrate_drive(speeds, wheels, start, seen_at)[:, :3].T
     poses = transform(rotation_z(angle), np.stack([x, y, 0 * x], axis=1))
     cuts = np.sort(rng.choice(np.arange(10, len(seen_at) - 10, 8), slips, replace=False))
     for k in cuts:
@@ -337,7 +337,9 @@ def calibrate_wheels(model: kv.Model, seed: int, slips: int, gross: float) -> Dr
     found = calibrate(model, [recording], "wheels fetch/base", held_out=0)
     seconds = time.process_time() - begun
     # Each piece between slips has a start of its own in the bound, as a rigid motion of the whole drive.
-    slopes = differences(lambda w: drive(speeds, w, start, seen_at)[:, :3], wheels).reshape(-1, 3, 3)
+    slopes = differences(lambda w: integrate_drive(speeds, w, start, seen_at)[:, :3], wheels).reshape(
+        -1, 3, 3
+    )
     piece = np.searchsorted(cuts, np.arange(len(seen_at)), side="right")
     begins = np.zeros((len(seen_at), 3, 3 * (slips + 1)))
     for k, n in enumerate(piece):

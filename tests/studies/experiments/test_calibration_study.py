@@ -14,7 +14,7 @@ from kineverse_studies.experiments.calibration import (
     arm_model,
     bound_of,
     camera_mount,
-    drive,
+    integrate_drive,
     measure,
     report,
 )
@@ -35,7 +35,7 @@ def test_a_drive_is_that_of_scipy():
         return [forward * math.cos(angle), forward * math.sin(angle), turn, left, right]
 
     found = solve_ivp(rates, (0, at[-1]), [*start, 0, 0], "DOP853", at, rtol=1e-10, atol=1e-12).y.T
-    assert np.abs(drive(speeds, wheels, start, at) - found).max() < 1e-8
+    assert np.abs(integrate_drive(speeds, wheels, start, at) - found).max() < 1e-8
 
 
 def test_the_arm_in_pinocchio_is_that_of_the_model():

@@ -176,12 +176,8 @@ class Calibration:
         origins and axes; all its other bytes are as they were. The remarks say what it has no number for,
         such as the radius of a wheel. A document (``.kv.json``) holds all corrections.
 
-        Raises
-        ------
-        FormatError
-            If the URDF is a template of xacro, has changed since it was loaded, or is not that of the model.
-        InvalidValueError
-            If the model has been edited since the calibration at what is corrected.
+        A URDF that is a template of xacro, has changed since it was loaded, or is not that of the model is
+        refused, and so is a model that was edited since at what is corrected.
         """
         corrected = self.model.copy()
         self.apply(corrected)

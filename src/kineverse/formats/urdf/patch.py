@@ -1,7 +1,7 @@
 """Corrected origins and axes of joints, written into the text of their URDF.
 
-Only the numbers that changed are replaced. All other bytes stay, and with them the transmissions, plugins,
-materials and comments that a model does not have.
+Only the numbers that changed are replaced. All other bytes stay, and with them comments, order, line ends and
+all that a model does not have.
 """
 
 from __future__ import annotations
