@@ -33,7 +33,7 @@ DIFFERENT = (
 )
 """What ends with status 1, as it finds what is to be shown."""
 
-ESTIMATED = ("fit",)
+ESTIMATED = ("fit", "calibrate")
 """Whose last digits depend on the linear algebra of the machine."""
 
 NARRATED = ("open",)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from pathlib import Path
 from typing import Any
@@ -38,6 +39,51 @@ CORNERS = ("front_left", "front_right", "rear_left", "rear_right")
 
 def wheels(*speeds: float) -> dict[str, float]:
     return {f"j/{corner}_wheel:velocity": float(s) for corner, s in zip(CORNERS, speeds, strict=True)}
+
+
+RADIUS, SECOND = kv.parameter("radius", 0.1), kv.parameter("second", 0.12)
+TRACK, LONG = kv.parameter("track", 0.5), kv.parameter("long", 0.7)
+SIZED_BY_EXPRESSIONS = [
+    kv.articulations.DifferentialDrive(**FLAT, radius=RADIUS, track=TRACK, speed=1, turn=2),
+    kv.articulations.DifferentialDrive(**FLAT, radius=(RADIUS, SECOND), track=TRACK, speed=1, turn=2),
+    kv.articulations.Mecanum(**FLAT, radius=RADIUS, track=TRACK, wheelbase=LONG, speed=1, turn=2),
+    kv.articulations.Ackermann(**FLAT, wheelbase=LONG, speed=1),
+]
+
+
+@pytest.mark.parametrize("base", SIZED_BY_EXPRESSIONS)
+def test_sizes_may_be_expressions_which_rates_and_limits_follow(base: Any, tmp_path: Path) -> None:
+    model = model_of(base)
+    assert_is_a_value(base, model, tmp_path)
+    sizes = {RADIUS: 0.2, SECOND: 0.25, TRACK: 0.4, LONG: 0.6}
+
+    def number(size: Any) -> Any:
+        return tuple(map(number, size)) if isinstance(size, tuple) else sizes[size]
+
+    given = {f: number(getattr(base, f)) for f in ("radius", "track", "wheelbase") if hasattr(base, f)}
+    numeric = model_of(dataclasses.replace(base, **given))
+    state = {s: 0.3 * (i + 1) for i, s in enumerate((*model.degrees_of_freedom, *model.speeds))} | sizes
+
+    def value(expression: Any) -> float:
+        one = kv.array(expression)
+        return float(one({s: state[s] for s in one.symbols}))
+
+    for coordinate, row in model.rates.items():
+        for speed, factor in row.items():
+            assert value(factor) == pytest.approx(value(numeric.rates[coordinate][speed]), rel=1e-14)
+    assert set(model.constraints) == set(numeric.constraints)
+    for name, constraint in model.constraints.items():
+        wanted = numeric.constraints[name].expression
+        assert value(constraint.expression) == pytest.approx(value(wanted), rel=1e-14)
+
+
+def test_wheels_of_two_radii_drive_a_curve() -> None:
+    base = kv.articulations.DifferentialDrive(**FLAT, radius=(0.1, 0.12), track=0.5)
+    model = model_of(base)
+    speeds = {"j/left_wheel:velocity": 2.0, "j/right_wheel:velocity": 2.0}
+    end = model.integrate(model.default_state(), speeds, 0.01)
+    assert end["j/angle"] == pytest.approx(2.0 * 0.02 / 0.5 * 0.01)
+    assert end["j/x"] == pytest.approx(2.0 * 0.11 * 0.01, rel=1e-6)
 
 
 @pytest.mark.parametrize("base", EVERY, ids=lambda o: type(o).__name__)
@@ -218,6 +264,12 @@ BROKEN: list[tuple[type[Any], dict[str, Any], str]] = [
     (kv.articulations.Mecanum, {**SIZES, "wheels": 4}, "not 4"),
     (kv.articulations.DifferentialDrive, {"radius": 1, "track": 1, "left": "a", "right": "a"}, r"'j' are 2 different paths, not \('a', 'a'\)"),
     (kv.articulations.DifferentialDrive, {"radius": 1, "track": 1, "left": "j/right_wheel"}, "2 different paths"),
+    (kv.articulations.DifferentialDrive, {"radius": (1, 0), "track": 1}, "radius of the differential drive 'j' is a positive, finite number, not 0"),
+    (kv.articulations.DifferentialDrive, {"radius": (1, 1, 1), "track": 1}, "one number or a pair"),
+    (kv.articulations.DifferentialDrive, {"radius": "x", "track": 1}, "is a number, not 'x'"),
+    (kv.articulations.DifferentialDrive, {"radius": 1, "track": kv.parameter("p", -1.0)}, "track of the differential drive 'j' is a positive, finite number, not -1.0"),
+    (kv.articulations.DifferentialDrive, {"radius": 1, "track": kv.velocity("p")}, "is about positions"),
+    (kv.articulations.Mecanum, {**SIZES, "radius": kv.parameter("p", 0.0)}, "radius of the mecanum 'j' is a positive"),
     (kv.articulations.DifferentialDrive, {"radius": 1, "track": 1, "speed": -1}, "'speed' of the differential drive 'j' is -1"),
     (kv.articulations.DifferentialDrive, {"radius": 1, "track": 1, "turn": nan}, "'turn' of the differential drive 'j' is nan"),
 ]  # fmt: skip

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from pathlib import Path
 from typing import Any
@@ -114,11 +115,32 @@ def test_velocity_rows_keep_joint_limits() -> None:
     assert end[kv.position("j/turn")] == pytest.approx(-1)
 
 
+def test_pitch_may_be_an_expression(tmp_path: Path) -> None:
+    pitch = kv.parameter("pitch", 0.02)
+    screw = kv.articulations.Screw(**WHERE, axis=(0, 0, 1), pitch=pitch, lower=-1, upper=1)
+    model = model_of(screw)
+    assert_is_a_value(screw, model, tmp_path)
+    pose = model.fk(WHERE["child"])
+    for value in (0.02, -0.5):
+        numeric = model_of(dataclasses.replace(screw, pitch=value)).fk(WHERE["child"])
+        wanted = numeric({kv.position("j"): 0.7})
+        np.testing.assert_allclose(pose({kv.position("j"): 0.7, pitch: value}), wanted, rtol=1e-14)
+    model.save(tmp_path / "screw.xml")
+    read = kv.load(tmp_path / "screw.xml")
+    (frame,) = (name for name in read.frames if name.split("/")[-1] == WHERE["child"])
+    at = {kv.position("j"): 0.7}
+    expression = read.fk(frame)
+    written = expression({s: at[kv.position(str(s).split("/")[-1])] for s in expression.symbols})
+    np.testing.assert_allclose(written, pose({**at, pitch: 0.02}), atol=1e-9)
+
+
 BROKEN: list[tuple[type[Any], dict[str, Any], str]] = [
     (kv.articulations.Screw, {"pitch": nan}, "pitch of the screw 'j' is a finite number, not nan"),
     (kv.articulations.Screw, {"pitch": inf}, "pitch of the screw 'j' is a finite number, not inf"),
     (kv.articulations.Screw, {"pitch": "fine"}, "pitch of the screw 'j' is a number, not 'fine'"),
     (kv.articulations.Screw, {"pitch": 0}, "pitch of the screw 'j' is 0"),
+    (kv.articulations.Screw, {"pitch": kv.parameter("p", 0.0)}, "pitch of the screw 'j' is 0"),
+    (kv.articulations.Screw, {"pitch": kv.velocity("p")}, "pitch of the screw 'j' is about positions"),
     (kv.articulations.Screw, {"pitch": 1, "axis": (0, 0, 0)}, "axis of joint 'j' has length zero"),
     (kv.articulations.Screw, {"pitch": 1, "lower": 2, "upper": 1}, "limits of 'j' are no range.*bound 2 and the upper bound 1"),
     (kv.articulations.Screw, {"pitch": 1, "velocity": -1}, "velocity limit of 'j' is -1; it cannot be negative"),

@@ -1,6 +1,7 @@
 """Strings that documents have for classes stay what they are, and with them the digests of models.
 
-``digests.json`` has the digests of models as they were before the classes were renamed. ``exact`` has those
+``digests.json`` has the digests of models as they were before the classes were renamed, and with the datum of
+what a URDF says besides since then. ``exact`` has those
 whose numbers come from Python's arithmetic and the C library; they came out equal with every kernel of OpenBLAS
 (``OPENBLAS_CORETYPE=Prescott`` to ``SkylakeX``), without FMA in the C library and without AVX in numpy. The
 scenes in :data:`SOLVED` have numbers that LAPACK or BLAS computes, whose last bits depend on the processor;
@@ -15,7 +16,6 @@ import hashlib
 import importlib
 import inspect
 import json
-import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,6 +23,7 @@ from typing import Any
 
 import pytest
 from document_models import Doubled, rich_model
+from scenes import SCENES, build_scene, scene_document
 
 import kineverse as kv
 from kineverse import gallery
@@ -34,10 +35,6 @@ from kineverse.formats.document.parameters import CLASSES, document_kind, find_c
 from kineverse.formats.locate import shipped_models
 from kineverse.model.body import Box, Capsule, Cone, Cylinder, Ellipsoid, Mesh, Sphere
 from kineverse.model.operation import Operation
-
-sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
-
-from scenes import SCENES, build_scene, scene_document
 
 FOLDER = Path(__file__).parent
 DIGESTS: dict[str, dict[str, str]] = json.loads((FOLDER / "digests.json").read_text("utf-8"))

@@ -193,7 +193,7 @@ def test_scenes_with_locks_and_wheels_move_alike_when_read_back(
     assert_same_motion(model, kv.load(tmp_path / f"m.{ending}"))
 
 
-@pytest.mark.parametrize("name", ["m.sdf", "m", "m.xml.txt"])
+@pytest.mark.parametrize("name", ["m.world", "m", "m.xml.txt"])
 def test_unknown_endings_are_refused_before_conversion(name: str, tmp_path: Path) -> None:
     with pytest.raises(kv.errors.FormatError, match=r"a model is saved to a name that ends in \.kv\.json"):
         kv.load("shelf_door").save(tmp_path / name)

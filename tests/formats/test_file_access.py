@@ -309,7 +309,7 @@ def test_symbolic_links_do_not_lead_out_of_a_package(put, tmp_path):
     ("name", "expected"),
     [
         ("door.stl", "is a mesh, and no model"),
-        ("scene.usda", "is USD"),
+        ("scene.usdz", "is a package of USD"),
         ("robot.mjb", "Load the MJCF it was made of"),
         ("robot.srdf", "Load the URDF"),
         ("model.config", "Load the .sdf that it names"),

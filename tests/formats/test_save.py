@@ -30,7 +30,7 @@ def test_every_ending_is_read_back(ending: str, model: kv.Model, tmp_path: Path)
 
 def test_other_endings_are_refused_with_those_there_are(model: kv.Model, tmp_path: Path) -> None:
     with pytest.raises(kv.errors.FormatError) as info:
-        model.save(tmp_path / "m.usd")
+        model.save(tmp_path / "m.dae")
     assert all(ending in str(info.value) for ending in ENDINGS)
 
 

@@ -20,7 +20,7 @@ def bounds(model: kv.Model, name: str) -> tuple[float, float]:
 def test_operations_have_prefixed_names_and_tags():
     model = model_of(SMALL, "a/b")
     assert set(model.frames) - {"world"} == {"a/b/base", "a/b/arm"}
-    assert model.history.tags == ["frame a/b/base", "body a/b/base", "joint a/b/elbow"]
+    assert model.history.tags == ["frame a/b/base", "body a/b/base", "joint a/b/elbow", "data a/b/base/urdf"]
     assert [str(s) for s in model.degrees_of_freedom] == ["a/b/elbow"]
     assert list(model.articulations) == ["a/b/elbow"]
     assert list(model.constraints) == ["a/b/elbow/position", "a/b/elbow/velocity"]
@@ -28,13 +28,14 @@ def test_operations_have_prefixed_names_and_tags():
 
 
 def test_names_without_prefix_are_those_of_the_file():
-    assert model_of(SMALL).history.tags == ["frame base", "body base", "joint elbow"]
+    assert model_of(SMALL).history.tags == ["frame base", "body base", "joint elbow", "data base/urdf"]
 
 
 def test_a_file_is_loaded_by_its_path(tmp_path):
     path = tmp_path / "small.urdf"
     path.write_text(SMALL)
-    assert kv.load(path, prefix="p").history.tags == ["frame p/base", "body p/base", "joint p/elbow"]
+    tags = kv.load(path, prefix="p").history.tags
+    assert tags == ["frame p/base", "body p/base", "joint p/elbow", "data p/base/urdf"]
     assert kv.load(str(path)).bodies["base"].collisions[0].geometry.folder == str(tmp_path)
 
 
@@ -43,7 +44,7 @@ WORLD = robot('<link name="world"/>', joint("j", "world", "l0"), links=1)
 
 def test_a_root_called_world_is_the_world_without_prefix():
     model = model_of(WORLD)
-    assert model.history.tags == ["joint j"]
+    assert model.history.tags == ["joint j", "data l0/urdf"]
     assert model.frames["l0"].parent == "world"
 
 
@@ -72,7 +73,7 @@ def test_a_link_called_world_that_is_not_the_root_needs_a_prefix():
 def test_empty_parts_of_names_are_left_out():
     text = robot('<link name="/base"/>', '<link name="arm//tip/"/>', joint("//elbow", "/base", "arm//tip/"))
     model = model_of(text, "p")
-    assert model.history.tags == ["frame p/base", "joint p/elbow"]
+    assert model.history.tags == ["frame p/base", "joint p/elbow", "data p/base/urdf"]
     assert model.frames["p/arm/tip"].parent == "p/base"
 
 

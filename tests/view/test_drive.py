@@ -2,6 +2,7 @@
 
 import math
 import time
+from functools import cache
 
 import numpy as np
 import pytest
@@ -50,9 +51,14 @@ def planar_loop():
     return model
 
 
+@cache
+def ball():
+    return kv.load("articulations/ball")
+
+
 @given(ANGLES)
 def test_quaternion_angles_round_trip(angles):
-    model = kv.load("articulations/ball")
+    model = ball()
     orientations = QuaternionAngles(model, complete(model))
     names = [f"ball/stick/{angle}" for angle in ("roll", "pitch", "yaw")]
     assert list(orientations.limits) == names

@@ -28,6 +28,7 @@ Tables = list[tuple[str, Table]]
 FIG4_CONFIGURATIONS = 20
 STREAMS, STREAM_SECONDS = 1, 45.0
 TYPE_CASES = 12
+CALIBRATED_DRAWS, CALIBRATED_DRIVES, HAND_EYES = 4, 1, 4
 GRID_SAMPLES = 3
 LOCKBOXES = 20
 """Every ninth cell of the grid, with one sample."""
@@ -45,6 +46,14 @@ def as_tables(report: Report) -> Tables:
 def tables_of(*tables: ReportTable) -> Tables:
     """Return tables of a report that the short form does not make as a whole."""
     return as_tables(Report("", "", tables, {}, Figure(lambda canvas: None, (1.0, 1.0))))
+
+
+@cache
+def calibration() -> Tables:
+    """Calibrate few draws, and one drive without and with slips."""
+    from kineverse_studies.experiments.calibration import measure, report
+
+    return as_tables(report(*measure(_quiet, CALIBRATED_DRAWS, CALIBRATED_DRIVES, HAND_EYES, seed=1000)))
 
 
 @cache
@@ -146,6 +155,14 @@ def joint_types() -> Tables:
     from kineverse_studies.experiments.joint_types import identify_cases, report_answers
 
     return as_tables(report_answers(identify_cases(TYPE_CASES, _quiet, Options(processes=1))))
+
+
+@cache
+def conversion() -> Tables:
+    """Write and check a few of the models."""
+    from kineverse_studies.experiments import Options, reproduce
+
+    return as_tables(reproduce("conversion", options=Options(quick=True, processes=1)))
 
 
 @cache

@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -25,7 +26,7 @@ from kineverse.model.read_recorder import ReadRecorder
 from kineverse.spatial import rotation_z, translation
 from kineverse.symbols import Symbol, position, velocity
 
-from .joint import Joint, check_joint_number
+from .joint import Joint, Size, check_joint_number, check_size
 from .limits import check_speed_limit, limit_constraints
 
 
@@ -112,18 +113,21 @@ class DifferentialDrive(Base, document_kind="DifferentialDrive"):
     """Differential drive: a base on two driven wheels, which cannot move sideways.
 
     The coordinates x, y [m] and θ [rad] move by the wheels' speeds (2022 paper, III-A1): with radius r and
-    track b, ẋ = r/2 cos θ (ω_l + ω_r), ẏ = r/2 sin θ (ω_l + ω_r), θ̇ = r/b (ω_r - ω_l).
+    track b, ẋ = r/2 cos θ (ω_l + ω_r), ẏ = r/2 sin θ (ω_l + ω_r), θ̇ = r/b (ω_r - ω_l). With different radii,
+    r_l ω_l and r_r ω_r stand for r ω_l and r ω_r.
 
     Attributes
     ----------
-    radius, track
-        Radius of the wheels, and the distance between them [m].
+    radius
+        Radius of the wheels [m], or those of the left and the right one; numbers or expressions.
+    track
+        Distance between the wheels [m], a number or an expression.
     left, right
         Paths of the wheels' degrees of freedom; by default ``name/left_wheel`` and ``name/right_wheel``.
     wheel_speed
         Limit of the wheels' speeds [rad/s]; None for no limit.
     speed
-        Limit of the speed √(ẋ² + ẏ²) = ``r/2 |ω_l + ω_r|`` [m/s]; None for no limit.
+        Limit of the speed √(ẋ² + ẏ²) = ``|r_l ω_l + r_r ω_r|/2`` [m/s]; None for no limit.
     turn
         Limit of the angular speed ``|θ̇|`` [rad/s]; None for no limit.
 
@@ -133,8 +137,8 @@ class DifferentialDrive(Base, document_kind="DifferentialDrive"):
         For a radius or a track that is not positive, or one wheel on both sides.
     """
 
-    radius: float
-    track: float
+    radius: Size | tuple[Size, Size]
+    track: Size
     left: str = ""
     right: str = ""
     wheel_speed: float | None = None
@@ -143,8 +147,21 @@ class DifferentialDrive(Base, document_kind="DifferentialDrive"):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self.check_lengths("radius", "track")
+        what = f"The radius of the {self.noun} '{self.name}'"
+        if isinstance(self.radius, (tuple, list)):
+            if len(self.radius) != 2:
+                raise InvalidValueError(f"{what} is one number or a pair (left, right), not {self.radius!r}.")
+            object.__setattr__(self, "radius", tuple(self.radius))
+        for radius in self.radii:
+            check_size(radius, what, positive=True)
+        self.check_sizes("track")
         self.check_wheels(self.wheels, 2)
+
+    @property
+    def radii(self) -> tuple[Size, Size]:
+        """Radii of the left and the right wheel [m]."""
+        left, right = self.radius if isinstance(self.radius, tuple) else (self.radius, self.radius)
+        return left, right
 
     @property
     def wheels(self) -> tuple[str, str]:
@@ -159,19 +176,24 @@ class DifferentialDrive(Base, document_kind="DifferentialDrive"):
         """Write the child frame, the rates and the limits."""
         x, y, angle = self.coordinates
         left, right = map(velocity, self.wheels)
-        along, about = self.radius / 2, self.radius / self.track
+        along = [radius / 2 for radius in self.radii]
+        about = [radius / self.track for radius in self.radii]
+        forward, turning = along[0] * left + along[1] * right, about[1] * right - about[0] * left
+        if self.radii[0] == self.radii[1]:
+            # The form that released documents have.
+            forward, turning = along[0] * (left + right), about[0] * (right - left)
         return Writes(
             frames=self.frames,
             constraints={
                 **self.speed_limit("wheel_speed", left, "left_wheel_speed"),
                 **self.speed_limit("wheel_speed", right, "right_wheel_speed"),
-                **self.speed_limit("speed", along * (left + right)),
-                **self.speed_limit("turn", about * (right - left)),
+                **self.speed_limit("speed", forward),
+                **self.speed_limit("turn", turning),
             },
             rates={
-                x: {left: along * np.cos(angle), right: along * np.cos(angle)},
-                y: {left: along * np.sin(angle), right: along * np.sin(angle)},
-                angle: {left: -about, right: about},
+                x: {left: along[0] * np.cos(angle), right: along[1] * np.cos(angle)},
+                y: {left: along[0] * np.sin(angle), right: along[1] * np.sin(angle)},
+                angle: {left: -about[0], right: about[1]},
             },
             articulations={self.name: self.record((x, y, angle), speeds=(left, right))},
         )
@@ -190,7 +212,7 @@ class Ackermann(Base, document_kind="Ackermann"):
     Attributes
     ----------
     wheelbase
-        L, the distance between the axles [m].
+        L, the distance between the axles [m], a number or an expression.
     steering
         Limit of ``|δ|`` in (0, π/2) [rad]; the smallest turning radius is L/tan(steering).
     steering_speed
@@ -204,14 +226,14 @@ class Ackermann(Base, document_kind="Ackermann"):
         For a wheelbase that is not positive, or a steering angle outside (0, π/2).
     """
 
-    wheelbase: float
+    wheelbase: Size
     steering: float = 0.6
     steering_speed: float | None = None
     speed: float | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self.check_lengths("wheelbase")
+        self.check_sizes("wheelbase")
         text = f"The steering angle of the {self.noun} '{self.name}'"
         if not 0 < check_joint_number(self.steering, text) < math.pi / 2:
             raise InvalidValueError(f"{text} is limited to something in (0, π/2) rad, not {self.steering!r}.")
@@ -255,7 +277,7 @@ class Mecanum(Base, document_kind="Mecanum"):
     Attributes
     ----------
     radius
-        Radius of the wheels [m].
+        Radius of the wheels [m], a number or an expression, like the next two.
     track, wheelbase
         Distance between left and right wheels, and between front and rear ones [m].
     wheels
@@ -274,9 +296,9 @@ class Mecanum(Base, document_kind="Mecanum"):
         For lengths that are not positive, or another number of wheels than four.
     """
 
-    radius: float
-    track: float
-    wheelbase: float
+    radius: Size
+    track: Size
+    wheelbase: Size
     wheels: tuple[str, ...] = ()
     wheel_speed: float | None = None
     speed: float | None = None
@@ -284,7 +306,7 @@ class Mecanum(Base, document_kind="Mecanum"):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self.check_lengths("radius", "track", "wheelbase")
+        self.check_sizes("radius", "track", "wheelbase")
         if not isinstance(self.wheels, tuple) or self.wheels:
             self.check_wheels(self.wheels, 4)
             object.__setattr__(self, "wheels", tuple(self.wheels))
@@ -295,7 +317,8 @@ class Mecanum(Base, document_kind="Mecanum"):
         x, y, angle = self.coordinates
         paths = self.wheels or tuple(f"{self.name}/{corner}_wheel" for corner in _CORNERS)
         wheels = tuple(map(velocity, paths))
-        along, about = self.radius / 4, self.radius / (2 * (self.track + self.wheelbase))
+        along = self.radius / 4
+        about = self.radius / (2 * (self.track + self.wheelbase))
         forward = dict.fromkeys(wheels, along)
         sideways = {wheel: sign * along for wheel, sign in zip(wheels, (-1, 1, 1, -1), strict=True)}
         turning = {wheel: sign * about for wheel, sign in zip(wheels, (-1, 1, -1, 1), strict=True)}
@@ -320,6 +343,7 @@ class Mecanum(Base, document_kind="Mecanum"):
 _CORNERS = ("front_left", "front_right", "rear_left", "rear_right")
 
 
-def _total(row: Mapping[Symbol, float]) -> Expression:
+def _total(row: Mapping[Symbol, Any]) -> Expression:
     terms = [factor * wheel for wheel, factor in row.items()]
-    return sum(terms[1:], terms[0])
+    total: Expression = sum(terms[1:], terms[0])
+    return total

@@ -6,7 +6,7 @@ import math
 from abc import abstractmethod
 from collections.abc import Container, Iterable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeAlias
 
 from kineverse._checks import real_number
 from kineverse.errors import DuplicateNameError, InvalidValueError, KineverseError
@@ -20,6 +20,8 @@ from kineverse.model.read_recorder import ReadRecorder
 from kineverse.symbols import Symbol, position
 
 from .limits import limit_constraints
+
+Size: TypeAlias = float | Expression  # a size of a joint, a number or an expression
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,6 +60,11 @@ class PlacedOperation(Operation):
         for field in fields:
             what = f"The {field} of the {self.noun} '{self.name}'"
             check_joint_number(getattr(self, field), what, positive=True)
+
+    def check_sizes(self, *fields: str) -> None:
+        """Check that fields are positive lengths [m], numbers or expressions."""
+        for field in fields:
+            check_size(getattr(self, field), f"The {field} of the {self.noun} '{self.name}'", positive=True)
 
     def check_texts(self, *fields: str) -> None:
         """Check that fields are names."""
@@ -247,6 +254,20 @@ def check_scalar(expression: object, what: str) -> Expression:
     if expression.shape:
         raise InvalidValueError(f"{what} is a scalar, not of shape {expression.shape}.")
     return expression
+
+
+def check_size(size: object, what: str, *, positive: bool = False) -> float | None:
+    """Check a size, a number or an expression; return its number, None if it depends on positions.
+
+    Parameters of an expression have their own values.
+    """
+    if not isinstance(size, Expression):
+        return check_joint_number(size, what, positive=positive)
+    expression = check_position_expression(size, what)
+    if any(symbol.has_derivative for symbol in expression.symbols):
+        return None
+    value = float(expression({s: s.value for s in expression.symbols}))
+    return check_joint_number(value, what, positive=positive)
 
 
 def check_joint_number(number: object, what: str, *, positive: bool = False) -> float:

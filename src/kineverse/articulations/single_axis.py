@@ -16,7 +16,7 @@ from kineverse.model.read_recorder import ReadRecorder
 from kineverse.spatial import X, Y, Z, rotation_about, translation_along
 from kineverse.symbols import position
 
-from .joint import Joint, OneDofJoint, check_axis, check_joint_number
+from .joint import Joint, OneDofJoint, Size, check_axis, check_size
 from .limits import FREE, Limits, check_limits
 
 
@@ -50,8 +50,8 @@ class Screw(OneDofJoint, document_kind="Screw"):
     Attributes
     ----------
     pitch
-        Displacement along the axis in one revolution, p [m]: positive for a right-handed thread, negative
-        for a left-handed one.
+        Displacement along the axis in one revolution, p [m], a number or an expression: positive for a
+        right-handed thread, negative for a left-handed one.
 
     Raises
     ------
@@ -59,11 +59,11 @@ class Screw(OneDofJoint, document_kind="Screw"):
         For a pitch of 0 or NaN.
     """
 
-    pitch: float
+    pitch: Size
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not check_joint_number(self.pitch, f"The pitch of the screw '{self.name}'"):
+        if check_size(self.pitch, f"The pitch of the screw '{self.name}'") == 0:
             raise InvalidValueError(
                 f"The pitch of the screw '{self.name}' is 0, so it does not move along its axis; "
                 "that is a kv.Revolute."

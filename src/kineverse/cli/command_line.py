@@ -59,6 +59,7 @@ COMMANDS: Mapping[str, tuple[str, str]] = MappingProxyType(
         ),
         "spheres": ("spheres", "cover collision shapes by spheres, and show how far these stick out"),
         "fit": ("fit", "identify the joint of a part from a table of its poses"),
+        "calibrate": ("calibrate", "correct joints, mounts and lengths of a model by what was seen"),
         "serve": ("serve", "serve a model that other processes read and edit, and keep it"),
         "world": (
             "live:WORLD",
@@ -70,7 +71,7 @@ COMMANDS: Mapping[str, tuple[str, str]] = MappingProxyType(
             "live:LEARN",
             "learn joints that nobody has described in a live system, and doubt known ones",
         ),
-        "keys": ("keys", "make the keys of a model server and its users, for other computers"),
+        "keys": ("exchange:KEYS", "make the keys of a model server and its users, for other computers"),
         "relay": ("exchange:RELAY", "relay a site's clients to a model server elsewhere"),
         "ls": ("exchange:LS", "list the model servers of this user"),
         "status": ("exchange:STATUS", "print how a model server is: times, clients, refused edits"),

@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import os
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from kineverse.errors import DuplicateNameError, FormatError, InvalidValueError
+from kineverse.formats.conversion_check import ConversionCheck, check_conversion, find_engine
 from kineverse.formats.document import to_json
 from kineverse.formats.export.capabilities import UnsupportedError
 from kineverse.formats.locate import locate_model
 from kineverse.formats.reader_warnings import collect_warnings
-from kineverse.model.registry import SaveResult, find_scheme, writable_suffixes
+from kineverse.model.registry import FrameDeviation, SaveResult, find_scheme, writable_suffixes
 
 from .arguments import add_model_options, load_model
 from .diff import format_pose_difference
@@ -24,25 +26,34 @@ if TYPE_CHECKING:
     import kineverse as kv
 
 HELP = """\
-IN is any model that can be loaded. OUT is a document (.kv.json), which holds the whole model, URDF (.urdf)
-or MJCF (.xml). A motion that the format cannot represent is refused by name, and nothing is written; with
---tolerance, such motions are approximated, and a guaranteed bound on the errors of frames is printed.
-Constraints that the format cannot represent, such as locks and couplings of wheel speeds, are left out and
-listed on standard error; --strict refuses these, too, and --leave-out names exceptions. The new file is read
-back before it becomes OUT. It is written whole or not at all, and replaces a file only with --force. If OUT
-is a dash, a document goes to standard output.
+IN is any model that can be loaded. OUT is a document (.kv.json), which holds the whole model, URDF (.urdf),
+MJCF (.xml) or SDF (.sdf). A motion that the format cannot represent is refused by name, and nothing is
+written; with --tolerance, such motions are approximated, and a guaranteed bound on the errors of frames is
+printed. Constraints that the format cannot represent, such as locks and couplings of wheel speeds, are left
+out and listed on standard error; --strict refuses these, too, and --leave-out names exceptions. The new file
+is read back before it becomes OUT. It is written whole or not at all, and replaces a file only with --force.
+If OUT is a dash, a document goes to standard output. From URDF to URDF, names of materials and elements such
+as <transmission> and <gazebo> are kept.
+
+USD (.usda, .usdc, .usd) holds the document of the model beside joints for other tools, so nothing is
+refused unless --strict is given; needs the extra usd.
 
 Mesh files are not copied; OUT refers to them by paths that are valid from its folder. Meshes that MuJoCo
 cannot read are converted, into a folder beside OUT; missing ones are left out of MJCF.
 
-To check that OUT moves like IN: kineverse diff IN OUT --values
+With --check, an engine of the format reads OUT on its own: pinocchio a URDF, MuJoCo an MJCF, drake an SDF. In
+100 states within limits, the poses of all frames in OUT are compared with those of IN. If one differs by more
+than 1e-9 m or rad (an approximated one by more than its bound), the joint is named and the status is 1; OUT
+is kept. To compare IN and OUT by Kineverse alone: kineverse diff IN OUT --values
 
 examples:
   kineverse convert robot.sdf robot.urdf
+  kineverse convert pr2 pr2.sdf --check
   kineverse convert robot.urdf robot.kv.json --prefix left --force
   kineverse convert live:home home.kv.json
   kineverse convert kitchen - | gzip > kitchen.kv.json.gz
   kineverse convert pr2 pr2.xml
+  kineverse convert pr2 pr2.usda
   kineverse convert garage.kv.json garage.urdf --strict --leave-out garage/lock
   kineverse convert articulations/pedal_bin bin.xml --tolerance 0.01"""
 
@@ -73,6 +84,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=float,
         help="largest error of any frame of OUT [m], [rad]; without it nothing is approximated",
     )
+    parser.add_argument(
+        "--check", action="store_true", help="compare OUT with IN in an engine that reads OUT on its own"
+    )
     parser.add_argument("--all", action="store_true", help=f"print more than {SHOWN} remarks")
     parser.add_argument("--json", action="store_true", help="report as one JSON object")
 
@@ -83,12 +97,15 @@ def run(arguments: argparse.Namespace) -> int:
     if not to_stdout:
         # Checked before the model is loaded, so that a wrong name fails at once.
         check_writable(arguments.target, arguments.source, arguments.force)
+        if arguments.check:
+            find_engine(arguments.target)
     else:
         given = {
             "--json": arguments.json,
             "--leave-out": arguments.leave_out,
             "--tolerance": arguments.tolerance is not None,
             "--strict": arguments.strict,
+            "--check": arguments.check,
         }
         option = next((name for name, is_given in given.items() if is_given), None)
         if option is not None:
@@ -107,6 +124,10 @@ def run(arguments: argparse.Namespace) -> int:
         else:
             saved = _save_model(model, arguments)
             size = os.path.getsize(saved.path)
+    check = None
+    if arguments.check:
+        with show_activity(f"checking {arguments.target}"):
+            check = check_conversion(model, saved.path, bounds=saved.errors)
     if saved.left_out:
         lines = [f"  {name} {reason}" for name, reason in saved.left_out.items()]
         count = format_count(len(lines), "thing")
@@ -114,11 +135,19 @@ def run(arguments: argparse.Namespace) -> int:
         shown = truncate_lines(lines, None if arguments.all else SHOWN, "  ")
         print("\n".join([head, *shown]), file=sys.stderr)
     if arguments.json:
-        print(json.dumps(_as_json(arguments, model, size, left_out, saved), allow_nan=False))
+        report = _as_json(arguments, model, size, left_out, saved)
+        if check is not None:
+            report["check"] = _check_as_json(check)
+        print(json.dumps(report, allow_nan=False))
     else:
         lines = _format_report(arguments, model, size, left_out, saved)
+        if check is not None:
+            lines[2:2] = _format_check(check)
         print("\n".join(lines), file=sys.stderr if to_stdout else sys.stdout)
-    return 0
+    if check is None or check.ok:
+        return 0
+    print(_format_wrong(arguments.target, check), file=sys.stderr)
+    return 1
 
 
 def _save_model(model: kv.Model, arguments: argparse.Namespace) -> SaveResult:
@@ -180,6 +209,50 @@ def _approximation_errors(saved: SaveResult) -> str:
     if angle:
         worst.append(f"{format_pose_difference(0.0, angle)} ({most_turned})")
     return f"{format_count(len(errors), 'frame')} approximated, off by at most {' and '.join(worst)}"
+
+
+def _format_check(check: ConversionCheck) -> list[str]:
+    where = f" ({check.frame}" + (f", joint {check.joint})" if check.joint else ")") if check.frame else ""
+    lines = [
+        f"  checked by {check.engine} {check.version}: {format_count(check.states, 'state')}, "
+        f"{format_count(check.frames, 'frame')}, largest difference {check.largest}{where}"
+    ]
+    if check.bounds != FrameDeviation():
+        lines.append(f"    bound of the approximated frames {check.bounds}")
+    return [*lines, *(f"    {remark}" for remark in check.remarks)]
+
+
+def _format_wrong(target: str, check: ConversionCheck) -> str:
+    name, error = next(iter(check.wrong.items()))
+    more = f", and {len(check.wrong) - 1} more" if len(check.wrong) > 1 else ""
+    return (
+        f"{target} does not move like the model: in {check.engine}, '{name}' is off by {error}{more}. "
+        f"The first joint that differs is '{check.cause}'. {target} is kept, for a look at it only."
+    )
+
+
+def _check_as_json(check: ConversionCheck) -> dict[str, object]:
+    def finite(value: float) -> float | None:
+        return value if math.isfinite(value) else None
+
+    largest = check.largest
+    return {
+        "engine": check.engine,
+        "version": check.version,
+        "states": check.states,
+        "frames": check.frames,
+        "largest": {
+            "distance": finite(largest.position),
+            "angle": finite(largest.angle),
+            "frame": check.frame,
+            "joint": check.joint,
+        },
+        "bound": {"distance": finite(check.bounds.position), "angle": finite(check.bounds.angle)},
+        "ok": check.ok,
+        "wrong": list(check.wrong),
+        "cause": check.cause,
+        "remarks": list(check.remarks),
+    }
 
 
 def _format_size(size: int) -> str:

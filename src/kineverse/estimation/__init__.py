@@ -1,6 +1,7 @@
-"""Estimation: state tracking, model identification and plausibility of models.
+"""Estimation: state tracking, calibration, model identification and plausibility of models.
 
 :mod:`kineverse.estimation.tracking` estimates the state of a known model,
+:mod:`kineverse.estimation.calibration` the geometry of a model,
 :mod:`kineverse.estimation.identification` identifies joints between observed frames, and
 :mod:`kineverse.estimation.plausibility` tests a model against observations. Layer 5.
 """
@@ -10,6 +11,15 @@ from typing import TYPE_CHECKING
 from kineverse._lazy import lazy_face
 
 if TYPE_CHECKING:
+    from .calibration import (
+        Calibration as Calibration,
+        Look as Look,
+        LookTable as LookTable,
+        ObservedPixel as ObservedPixel,
+        WheelOdometry as WheelOdometry,
+        calibrate as calibrate,
+        read_looks as read_looks,
+    )
     from .identification import (
         Family as Family,
         FamilyParameter as FamilyParameter,

@@ -54,6 +54,12 @@ def pose_covariance(position: float, orientation: float) -> Array:
     return np.diag([position**2] * 3 + [orientation**2] * 3)
 
 
+UNKNOWN_NOISE = (0.005, math.radians(1.0))
+"""Medians of the unknown standard deviations of positions [m] and orientations [rad]."""
+
+NOISE_SPREAD = math.log(5.0)
+"""Standard deviation of their logarithms: a factor of 5."""
+
 CHI_SQUARED_6 = 22.5  # quantile of χ² with six degrees of freedom that is exceeded once in a thousand
 _ROTATION_VOLUME = 8 * math.pi**2  # volume of SO(3) in rotation vectors [rad³]
 

@@ -401,7 +401,13 @@ class Connection:
 
     def _explain_silence(self) -> str:
         server = f"The server {self.address.name!r}"
-        if self.user and self.is_online and self.transport.is_alive(self.key("alive/*"), _LOOKING):
+        end = time.monotonic() + (_LOOKING if self.user and self.is_online else 0.0)
+        is_there = False
+        # For moments after a connection was made, nobody is seen.
+        while not is_there and time.monotonic() < end:
+            is_there = self.transport.is_alive(self.key("alive/*"), _LOOKING)
+            time.sleep(0.0 if is_there else _PAUSE)
+        if is_there:
             return (
                 f"{server} is there, and does not answer the user {self.user!r}: rights.toml of the server, "
                 "or of the relay, does not name this user, or has been changed since the start."

@@ -22,6 +22,12 @@ Coefficients: TypeAlias = tuple[float, ...]  # coefficients of the powers of a c
 IDENTITY_COEFFICIENTS: Coefficients = (0.0, 1.0)
 
 
+def dynamics_number(dynamics: Mapping[str, Any], key: str) -> float | None:
+    """Return a number of the dynamics of a joint; None if there is none, or no number."""
+    value = dynamics.get(key)
+    return float(value) if isinstance(value, (int, float)) and not math.isnan(value) else None
+
+
 @dataclass
 class JointBounds:
     """Limits of a joint's position and velocity, and the soft limits of its safety controller.

@@ -7,6 +7,7 @@ from kineverse.model.registry import FileFormat
 from .xml_reader import read_root_tag
 
 DOCUMENT_SUFFIXES = (".kv.json", ".kv.msgpack")
+USD_SUFFIXES = (".usda", ".usdc", ".usd")
 
 
 def is_mjcf(name: str, content: bytes) -> bool:
@@ -39,6 +40,7 @@ def list_file_formats() -> tuple[FileFormat, ...]:
             read=f"{formats}.urdf.operations:urdf_file_operations",
             written=(".urdf",),
             write=f"{formats}.urdf.writer:to_urdf",
+            engine=f"{formats}.engines:PinocchioEngine",
             recognize=_is_urdf,
         ),
         FileFormat(
@@ -47,6 +49,7 @@ def list_file_formats() -> tuple[FileFormat, ...]:
             read=f"{formats}.mjcf.operations:mjcf_file_operations",
             written=(".xml", ".mjcf"),
             write=f"{formats}.mjcf.writer:to_mjcf",
+            engine=f"{formats}.engines:MujocoEngine",
             recognize=is_mjcf,
             loop_element="equality",
             reference=b"file",
@@ -55,8 +58,27 @@ def list_file_formats() -> tuple[FileFormat, ...]:
             name="SDF",
             suffixes=(".sdf", ".world"),
             read=f"{formats}.sdf.operations:sdf_file_operations",
+            written=(".sdf",),
+            write=f"{formats}.sdf.writer:to_sdf",
+            engine=f"{formats}.engines:DrakeEngine",
             loop_element="joint",
             reference=b"include",
+        ),
+        FileFormat(
+            name="USD",
+            suffixes=USD_SUFFIXES,
+            read=f"{formats}.usd.operations:usd_file_operations",
+            written=USD_SUFFIXES,
+            write=f"{formats}.usd.writer:to_usd",
+            engine=f"{formats}.usd.kinematics:UsdEngine",
+            loop_element="joint",
+        ),
+        FileFormat(
+            name="PartNet-Mobility",
+            suffixes=("mobility_v2.json",),
+            read=f"{formats}.partnet.operations:partnet_file_operations",
+            folder_file="mobility_v2.json",
+            reference=b"[",  # meshes are named by result.json beside it
         ),
         FileFormat(
             name="xacro",

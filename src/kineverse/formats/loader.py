@@ -13,8 +13,9 @@ from kineverse._runtime import no_collection
 from kineverse.errors import FormatError, InvalidValueError, KineverseError, MissingDependencyError
 from kineverse.model import registry
 from kineverse.model.edit import Edit
+from kineverse.model.history import HistoryEntry
 from kineverse.model.model import Model, Snapshot
-from kineverse.model.registry import FileContent, FileFormat, LoopTreatment, check_loops
+from kineverse.model.registry import FileContent, FileFormat, LoopTreatment, SourceFile, check_loops
 from kineverse.symbols import Symbol
 
 from .file_formats import DOCUMENT_SUFFIXES
@@ -25,12 +26,11 @@ from .reader_warnings import collect_warnings, warn
 from .root_folder import NOWHERE, find_root
 
 READ = (
-    "URDF (.urdf, .xml), SDF (.sdf, .world), MJCF (.xml, .mjcf), templates of xacro (.xacro) and documents "
-    "(.kv.json, .kv.msgpack)"
+    "URDF (.urdf, .xml), SDF (.sdf, .world), MJCF (.xml, .mjcf), USD (.usda, .usdc, .usd), PartNet-Mobility "
+    "(mobility_v2.json), templates of xacro (.xacro) and documents (.kv.json, .kv.msgpack)"
 )
 
 _MESHES = (".stl", ".obj", ".dae", ".ply", ".glb", ".gltf", ".off", ".3mf", ".msh")
-_USD = (".usd", ".usda", ".usdc", ".usdz")
 
 _ADVICE = {
     **dict.fromkeys(
@@ -38,9 +38,7 @@ _ADVICE = {
         "is a mesh, and no model. A description names it as the shape of a link; "
         "'kineverse decompose' takes the file itself.",
     ),
-    **dict.fromkeys(
-        _USD, "is USD, which is not read. Convert it to URDF or MJCF with the tool that it comes from."
-    ),
+    ".usdz": "is a package of USD, which is not read. Take the USD file out of it: unzip model.usdz",
     ".mjb": (
         "is a model that MuJoCo has compiled, which is not read. Load the MJCF it was made of, or write one: "
         "mujoco.mj_saveLastXML('model.xml', model)."
@@ -96,10 +94,11 @@ def load(
     Parameters
     ----------
     source
-        Path of a ``.urdf``, ``.sdf``, ``.xml`` (MJCF, or URDF), ``.xacro``, ``.kv.json`` or ``.kv.msgpack``
-        file, or a name such as ``kitchen``, ``pr2`` or ``articulations/screw``, see
-        :func:`kineverse.formats.locate.locate_model`. ``live:NAME`` is a model that other processes edit as
-        well: the result follows it, and edits of the result are theirs.
+        Path of a ``.urdf``, ``.sdf``, ``.xml`` (MJCF, or URDF), ``.usda``, ``.xacro``, ``.kv.json`` or
+        ``.kv.msgpack`` file, or of a ``mobility_v2.json`` or its folder; or a name such as ``kitchen``,
+        ``pr2`` or ``articulations/screw``, see :func:`kineverse.formats.locate.locate_model`. ``live:NAME``
+        is a model that other processes edit as well: the result follows it, and edits of the result are
+        theirs.
     prefix
         Prefix of the names of all frames and degrees of freedom, without the slash. A shipped model has its
         own name as prefix unless another is given (``screw`` for ``articulations/screw``); ``""`` means none.
@@ -196,6 +195,17 @@ def include(
     return list(_applied(edit, found, _content(found), prefix, _root(found, root), strict, loops, given))
 
 
+def check_readable(content: bytes, path: Path) -> None:
+    """Check that what a writer would write to a file is read again, with its loops."""
+    source = Source(path)
+    try:
+        with collect_warnings(), no_collection(), Model().edit() as edit:
+            for _ in _applied(edit, source, content, None, _root(source, None), False, "solve", {}):
+                pass
+    except KineverseError as error:
+        raise FormatError(f"What would be written cannot be read again: {error}") from error
+
+
 def _arguments(
     source: str | os.PathLike[str], arguments: Mapping[str, object] | None
 ) -> tuple[str | os.PathLike[str], dict[str, str]]:
@@ -225,25 +235,26 @@ def _applied(
     prefix = source.shipped if prefix is None else prefix
     file_format = _format(source, content)
     if file_format is not None:
+        digest = hashlib.blake2b(content).digest()
+        edit.record_source(SourceFile(source.path, digest, prefix or None, root, source.shipped))
         file = FileContent(source.path, content, prefix or None, root, strict, source.shipped, arguments)
-        if file_format.exact:
-            for entry in file_format.operations(file):
-                yield edit.link(entry)
-            return
         operations = file_format.operations(file)
     else:
         built = registry.COLLECTIONS[source.collection].operations(source.path.name, prefix or None)
         operations = ((operation.default_tag(), operation) for operation in built)
     if file_format is None or not file_format.loop_element:
-        for tag, operation in operations:
-            yield edit.apply(operation, tag)
+        for item in operations:
+            yield edit.link(item) if isinstance(item, HistoryEntry) else edit.apply(item[1], item[0])
         return
     # Imported when used, as most files have no loops: its imports take longer than a file.
     from .loop_closures import LoopClosures
 
     closures = LoopClosures(edit, edit.model, source.path.name, file_format.loop_element, loops)
-    for tag, operation in operations:
-        yield from closures.apply(tag, operation)
+    for item in operations:
+        if isinstance(item, HistoryEntry):  # of a document inside the file
+            yield edit.link(item)
+        else:
+            yield from closures.apply(*item)
     yield from closures.finish()
 
 

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
+
+from msgspec.structs import replace
 
 from kineverse._checks import finite_number
 from kineverse.errors import FormatError, InvalidValueError
 from kineverse.model import registry
 from kineverse.model.model_view import ModelView
+from kineverse.model.operation import Operation
 from kineverse.model.registry import FileFormat, SaveResult
 
 from .description import WrittenFile
@@ -29,8 +32,8 @@ def save(
 ) -> SaveResult:
     """Write a model to a file in the format of its ending.
 
-    The file is replaced atomically; after an error, the old file is unchanged. URDF and MJCF are read again
-    before that, MJCF by MuJoCo if it is installed. Meshes that MuJoCo cannot read are converted, into a
+    The file is replaced atomically; after an error, the old file is unchanged. URDF, MJCF and SDF are read
+    again before that, MJCF by MuJoCo if it is installed. Meshes that MuJoCo cannot read are converted, into a
     folder next to the file.
     """
     target = _target(path)
@@ -51,6 +54,38 @@ def save(
     _put(target, written)
     warn(f"{target.name}: {remark}" for remark in written.remarks)
     return SaveResult(target, written.remarks, written.errors, dict(written.left_out))
+
+
+def save_corrections(
+    model: ModelView,
+    before: Mapping[str, Operation],
+    corrected: Mapping[str, Operation],
+    path: str | os.PathLike[str],
+    source: str | os.PathLike[str] | None = None,
+) -> SaveResult:
+    """Write a corrected model, given its operations before and after the correction, by tag.
+
+    A URDF is the file that the model was loaded from, or ``source``, in which only the corrected numbers are
+    other ones. Any other file is written as by :func:`save`.
+    """
+    from .urdf.patch import find_source, patch_urdf  # imported when used, as it imports the articulations
+
+    target = _target(path)
+    file_format = _check(target)
+    is_urdf = "urdf" in file_format.write
+    file = find_source(model.sources, corrected, source) if is_urdf else None
+    if file is None:
+        if source is not None:
+            raise FormatError(f"{target.name} is written whole, so it has no source. Leave source= out.")
+        saved = save(model, target)
+        if file_format.exact:
+            return saved
+        remark = "written whole, as no URDF is known that the model was loaded from"
+        return replace(saved, remarks=(remark, *saved.remarks))
+    written = patch_urdf(file, before, corrected, target.absolute().parent)
+    _put(target, written)
+    warn(f"{target.name}: {remark}" for remark in written.remarks)
+    return SaveResult(target, written.remarks)
 
 
 def _put(target: Path, written: WrittenFile) -> None:

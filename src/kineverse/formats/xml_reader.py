@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
-from typing import NoReturn, TypeAlias
+from typing import NamedTuple, NoReturn, TypeAlias
 from xml.parsers import expat
 from xml.parsers.expat import errors
 
@@ -174,6 +174,43 @@ def read_root_tag(data: bytes) -> str:
     return found[0] if found else ""
 
 
+class StartTag(NamedTuple):
+    """Start tag of an element in a document of UTF-8, ``data[begin:end]``."""
+
+    element: Element  # without its children
+    depth: int  # 1 for the root
+    begin: int
+    end: int
+
+
+def find_start_tags(data: bytes) -> list[StartTag]:
+    """Return all start tags of a document in UTF-8 that :func:`parse_xml` has read, in its order."""
+    same_length, _ = _declared(data, lambda *_: None)
+    text = _bytes(_commented(same_length, lambda *_: None))
+    before = len(data) - len(text)  # the byte order mark, which may have been removed
+    parser = expat.ParserCreate("utf-8")
+    found: list[StartTag] = []
+    depth = 0
+
+    def start(tag: str, attributes: dict[str, str]) -> None:
+        nonlocal depth
+        depth += 1
+        begin = parser.CurrentByteIndex
+        whole = _START_TAG.match(text, begin)
+        assert whole is not None
+        element: Element = (tag, attributes, [], parser.CurrentLineNumber)
+        found.append(StartTag(element, depth, begin + before, whole.end() + before))
+
+    def end(_: str) -> None:
+        nonlocal depth
+        depth -= 1
+
+    parser.StartElementHandler, parser.EndElementHandler = start, end
+    parser.Parse(text, True)
+    return found
+
+
+_START_TAG = re.compile(rb"<(?:[^>\"']|\"[^\"]*\"|'[^']*')*>")
 _DECLARED = re.compile(rb"\s*(?:<!--(?:(?!-->).)*-->\s*)*<\?xml\s[^<>]*\?>", re.DOTALL)
 _GOOD = re.compile(rb"<\?xml\s+version\s*=\s*[\"']1\.\d[\"']")
 _ENCODING = re.compile(rb"encoding\s*=\s*[\"']([\w.-]{1,40})[\"']")
@@ -236,6 +273,18 @@ def _commented(data: str | bytes, on_recoverable_error: XmlFaultHandler) -> str 
             start = end + 3
         at = end + 3
     return b"".join([*pieces, content[start:]]) if pieces else data
+
+
+def decode_xml(data: str | bytes) -> str | None:
+    """Return the text of a document; None if it cannot be decoded."""
+    if isinstance(data, str):
+        return data
+    said = _ENCODING.search(data[:_CHUNK_BYTES].replace(b"\0", b"").partition(b"?>")[0])
+    encoding = "utf-8-sig" if said is None else said[1].decode()
+    try:
+        return data.decode(encoding)
+    except (UnicodeDecodeError, LookupError):
+        return None
 
 
 def read_name(element: Element) -> str:

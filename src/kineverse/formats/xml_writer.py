@@ -24,11 +24,16 @@ _ESCAPES = {
 
 @dataclass
 class Tag:
-    """Element of XML: attributes in order, and child elements."""
+    """Element of XML: attributes in order, and child elements, or text in place of these.
+
+    ``verbatim`` is the whole element as text of a document, written in place of all others.
+    """
 
     name: str
     attributes: dict[str, str] = field(default_factory=dict)
     inside: list[Tag] = field(default_factory=list)
+    text: str = ""
+    verbatim: str = ""
 
     def add(self, kind: str, /, **attributes: str | float | Iterable[float] | None) -> Tag:
         """Add a child element and return it; attributes that are None are left out."""
@@ -36,6 +41,14 @@ class Tag:
         for key, value in attributes.items():
             tag.give(key.rstrip("_"), value)
         self.inside.append(tag)
+        return tag
+
+    def add_text(
+        self, kind: str, text: str | float | Iterable[float], /, **attributes: str | float | None
+    ) -> Tag:
+        """Add a child element that contains text, a number or several, and return it."""
+        tag = self.add(kind, **attributes)
+        tag.text = text if isinstance(text, str) else format_numbers(text)
         return tag
 
     def give(self, key: str, value: str | float | Iterable[float] | None) -> None:
@@ -55,9 +68,15 @@ def format_xml(root: Tag, remarks: Iterable[str] = ()) -> bytes:
         if isinstance(tag, str):
             lines.append(" " * depth + tag)
             continue
+        if tag.verbatim:
+            lines.append(" " * depth + tag.verbatim)
+            continue
         start = tag.name + "".join(
             f' {key}="{escape_attribute(value)}"' for key, value in tag.attributes.items()
         )
+        if tag.text:
+            lines.append(f"{' ' * depth}<{start}>{escape_attribute(tag.text)}</{tag.name}>")
+            continue
         if not tag.inside:
             lines.append(f"{' ' * depth}<{start}/>")
             continue

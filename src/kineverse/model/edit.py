@@ -279,6 +279,10 @@ class Edit:
         """The edited model, which shows the edit so far."""
         return self._model
 
+    def record_source(self, source: registry.SourceFile) -> None:
+        """Note that operations of the edit are from a file."""
+        self._model._sources = (*self._model._sources, source)
+
     # -- inside --------------------------------------------------------------------------------------------
 
     def _tag(self, operation: Operation, tag: str | None) -> str:

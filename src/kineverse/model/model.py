@@ -20,7 +20,7 @@ from .edit import Edit
 from .history import History, HistoryEntry
 from .model_view import ModelView
 from .read_recorder import ABSENT
-from .registry import LoopTreatment
+from .registry import LoopTreatment, SourceFile
 
 
 class EditContext(AbstractContextManager["Edit"]):
@@ -59,7 +59,12 @@ class Model(ModelView):
     One thread edits at a time, and readers in other threads wait for it; a :meth:`snapshot` never changes.
     """
 
-    def __init__(self, _entries: Iterable[HistoryEntry] | History = (), _version: int = 0) -> None:
+    def __init__(
+        self,
+        _entries: Iterable[HistoryEntry] | History = (),
+        _version: int = 0,
+        _sources: tuple[SourceFile, ...] = (),
+    ) -> None:
         if isinstance(_entries, str | os.PathLike):
             raise ExpressionError(
                 f"A model begins empty, with kv.Model(). To load one: kv.load({os.fspath(_entries)!r})."
@@ -76,6 +81,7 @@ class Model(ModelView):
             if _version == 1:  # all of it comes from one commit
                 _entries.commits[1] = {entry.tag: (None, entry) for entry in _entries.sequence}
         self._history = _entries
+        self._sources = _sources
         self._edit: Edit | None = None
         self._listeners = Listeners()
         super().__init__(self._history.head, _version)
@@ -250,14 +256,14 @@ class Model(ModelView):
         with self._lock, no_collection():
             self._settle()
             head = {kind: dict(self._history.ordered(kind)) for kind in self._history.head}
-            return Snapshot(head, tuple(self._history.sequence), self._version)
+            return Snapshot(head, tuple(self._history.sequence), self._version, self._sources)
 
     def copy(self) -> Model:
         """Return an independent model with the same operations, without applying them again."""
         # No object made here is garbage, so the collector would only cost time.
         with self._lock, no_collection():
             self._settle()
-            return Model(self._history.copy(), self._version)
+            return Model(self._history.copy(), self._version, self._sources)
 
     __copy__ = copy
 
@@ -272,9 +278,14 @@ class Snapshot(ModelView):
     """Immutable model at one version, with all queries. Snapshots are equal if all values are equal."""
 
     def __init__(
-        self, head: dict[str, dict[str, Any]], entries: tuple[HistoryEntry, ...], version: int
+        self,
+        head: dict[str, dict[str, Any]],
+        entries: tuple[HistoryEntry, ...],
+        version: int,
+        sources: tuple[SourceFile, ...] = (),
     ) -> None:
         self._entries = entries
+        self._sources = sources
         super().__init__(head, version)
 
     @property
@@ -284,7 +295,7 @@ class Snapshot(ModelView):
 
     def model(self) -> Model:
         """Return a new model with the content of the snapshot."""
-        return Model(self._entries, self._version)
+        return Model(self._entries, self._version, self._sources)
 
     @property
     def tags(self) -> list[str]:
@@ -300,4 +311,4 @@ class Snapshot(ModelView):
         return hash(tuple(self.tags))
 
     def __reduce__(self) -> Any:
-        return Snapshot, (self._head, self._entries, self._version)
+        return Snapshot, (self._head, self._entries, self._version, self._sources)

@@ -22,7 +22,7 @@ from kineverse.symbols import Symbol, check_symbols, parse_symbol_name
 from . import registry
 from .constraint import TOLERANCE, Constraint, ConstraintLike, as_constraint
 from .operation import ARTICULATIONS, CONSTRAINTS, map_expressions
-from .registry import SaveResult
+from .registry import SaveResult, SourceFile
 from .symbolic_view import SymbolicView, cached_for_version
 
 if TYPE_CHECKING:
@@ -41,6 +41,13 @@ class ModelView(SymbolicView):
 
     This class adds the queries that take or return numbers to those of :class:`SymbolicView`.
     """
+
+    _sources: tuple[SourceFile, ...] = ()
+
+    @property
+    def sources(self) -> tuple[SourceFile, ...]:
+        """Files that the model was loaded from, or that were included in it."""
+        return self._sources
 
     # -- constraints ---------------------------------------------------------------------------------------
 
@@ -508,16 +515,16 @@ class ModelView(SymbolicView):
         leave_out: Iterable[str] = (),
         strict: bool = False,
     ) -> SaveResult:
-        """Write the model to a file: a document (.kv.json), URDF (.urdf) or MJCF (.xml).
+        """Write the model to a file: a document (.kv.json), URDF (.urdf), MJCF (.xml) or SDF (.sdf).
 
-        A document contains the whole model. URDF and MJCF cannot express all motions and constraints: motions
+        A document contains the whole model. The others cannot express all motions and constraints: motions
         are refused by name, constraints are left out with a remark; see :func:`kineverse.formats.saver.save`.
 
         Parameters
         ----------
         tolerance
-            Largest error of a frame in URDF and MJCF, in position [m] and angle [rad], guaranteed; None for
-            no error.
+            Largest error of a frame in such a file, in position [m] and angle [rad], guaranteed; None for no
+            error.
         leave_out
             Names of constraints and articulations to leave out.
         strict

@@ -203,6 +203,10 @@ class Operation(ABC):
         """Return what an operation of a document finds in a model; None if it has its code."""
         return None
 
+    def rebuild(self) -> Operation | None:
+        """Return the operation as a value of its class; None for one of a document without its class."""
+        return self
+
     def below(self, prefix: str) -> Operation | None:
         """Return the operation with its names below a prefix that ends with a slash.
 

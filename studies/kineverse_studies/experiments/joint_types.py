@@ -22,9 +22,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from kineverse.estimation import identify, pose_covariance
-from kineverse.estimation.identification.noise_estimation import UNKNOWN_NOISE
 from kineverse.estimation.identification.result import SURE, NoiseDeviations
 from kineverse.estimation.identification.solver import solver
+from kineverse.estimation.noise import UNKNOWN_NOISE
 from kineverse.lie import Array, exp_so3, quaternion, retract, transform, translation, unit_vector
 from kineverse.view.plots import Figure
 

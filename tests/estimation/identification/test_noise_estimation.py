@@ -17,10 +17,11 @@ from kineverse.estimation.identification.joint_identification import WEIGHTS
 from kineverse.estimation.identification.least_squares import InitialGuess
 from kineverse.estimation.identification.model_selection import prepare_data, solve_with_inliers
 from kineverse.estimation.identification.native import library
-from kineverse.estimation.identification.noise_estimation import UNKNOWN_NOISE, scale_noise
+from kineverse.estimation.identification.noise_estimation import scale_noise
 from kineverse.estimation.identification.observations import check_observations
 from kineverse.estimation.identification.result import NoiseDeviations
 from kineverse.estimation.identification.solver import solver
+from kineverse.estimation.noise import UNKNOWN_NOISE
 from kineverse.lie import transform
 from kineverse_studies.experiments.joint_types import (
     Setting,

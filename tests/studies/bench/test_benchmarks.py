@@ -32,7 +32,16 @@ SHORT = ("call", "frames", "batch", "edit", "examples")
 
 
 # Some of their rows are about robots, kitchens and examples that the minimal settings leave out.
-PARTS = ("geometry", "inverse_kinematics", "examples", "document", "edit", "motion", "identification", "learning")
+PARTS = (
+    "geometry",
+    "inverse_kinematics",
+    "examples",
+    "document",
+    "edit",
+    "motion",
+    "identification",
+    "learning",
+)
 
 
 def rows_of_markdown(text):

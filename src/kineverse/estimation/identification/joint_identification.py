@@ -12,13 +12,12 @@ import numpy.typing as npt
 
 from kineverse.errors import InvalidValueError, UnknownNameError, suggest
 from kineverse.estimation.linear_algebra import singularity_named
-from kineverse.estimation.noise import Outliers, as_outliers, pose_covariance
+from kineverse.estimation.noise import UNKNOWN_NOISE, Outliers, as_outliers, pose_covariance
 
 from .curve import CURVE
 from .families import Family
 from .model_check import solve_joints, weigh_and_check
 from .model_selection import prepare_data
-from .noise_estimation import UNKNOWN_NOISE
 from .observations import check_observations
 from .result import IdentificationResult
 

@@ -16,6 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from kineverse.estimation.noise import NOISE_SPREAD, UNKNOWN_NOISE
 from kineverse.lie import Array, skew
 
 from .least_squares import InitialGuess, Solution
@@ -25,21 +26,17 @@ from .observations import Observations
 from .result import NoiseDeviations
 from .solver import solver
 
-UNKNOWN_NOISE = (0.005, math.radians(1.0))
-"""Medians of the unknown standard deviations of positions [m] and orientations [rad].
-
-That of positions is a thousandth of the length scale of the data, see :mod:`.normalisation`, where that is
-more: of cranes, and in millimetres.
-"""
-
+# Median of the size of position noise, in length scales of the data (see .normalisation), where that is more
+# than in metres: of cranes, and in millimetres.
 _SHARE = 1e-3
-_SPREAD = math.log(5.0)  # standard deviation of their logarithms: a factor of 5
 
 # Factors on the medians for further first solutions: ratios of position to orientation noise of 16 and 1/16.
 _STARTS = ((4.0, 0.25), (0.25, 4.0))
 # Least factor, 5 µm and 0.001°. Without it the likelihood of identical poses has no maximum.
 _ROUNDING = 1e-3
-_COARSE = _SPREAD * np.array([-2.0, -1.0, 0.0, 1.0, 2.0])  # logarithms of the factors of the first search
+_COARSE = NOISE_SPREAD * np.array(
+    [-2.0, -1.0, 0.0, 1.0, 2.0]
+)  # logarithms of the factors of the first search
 _FAR = 0.05  # factor on a median below which a motion is solved again
 _BETTER = 0.5  # log density by which another start has to be better
 # Largest number of Newton steps, their largest length, and the step of finite differences, in deviations.
@@ -124,8 +121,8 @@ class _NoiseSearch:
 
     def log_density(self, logs: Array) -> Array:
         """Return the log evidence and prior at logarithms of the factors, (M, d)."""
-        prior = -0.5 * np.sum((logs / _SPREAD) ** 2, axis=1)
-        prior -= self.dimensions * math.log(_SPREAD * math.sqrt(math.tau))
+        prior = -0.5 * np.sum((logs / NOISE_SPREAD) ** 2, axis=1)
+        prior -= self.dimensions * math.log(NOISE_SPREAD * math.sqrt(math.tau))
         return np.asarray(prior + self.log_evidences(logs))
 
     def maximise_anywhere(self) -> _NoiseMode:
@@ -160,7 +157,7 @@ class _NoiseSearch:
                 shift = stencil[best] @ width.T  # the quadratic does not hold so far from here
             # The root is at most twice as wide as the prior in any direction.
             left, widths, right = np.linalg.svd(root @ axes / np.sqrt(bends))
-            logs, root = logs + shift, left * np.minimum(widths, 2.0 * _SPREAD) @ right
+            logs, root = logs + shift, left * np.minimum(widths, 2.0 * NOISE_SPREAD) @ right
             if distance < _SETTLED and bends[0] > _FLAT and bends[-1] < _SHARP:
                 break
         return _NoiseMode(logs, root, float(self.log_density(logs[None])[0]))

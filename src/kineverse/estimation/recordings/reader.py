@@ -67,15 +67,30 @@ def read_recording(
     FormatError
         If the table cannot be read, or its meaning is ambiguous. The message names the line or the option.
     """
-    table = read_table(Path(source)) if isinstance(source, (str, os.PathLike)) else convert_frame(source)
-    given = {}
+    table = open_table(source)
+    names = columns.split(",") if isinstance(columns, str) else columns
+    return read_tracks(table, None if names is None else [name.strip() for name in names], units)
+
+
+def open_table(source: str | os.PathLike[str] | Any) -> Table:
+    """Return the cells of a text file, a data frame or an array."""
+    return read_table(Path(source)) if isinstance(source, (str, os.PathLike)) else convert_frame(source)
+
+
+def read_tracks(table: Table, names: list[str] | None = None, units: str | None = None) -> Recording:
+    """Return the poses in a table, with its columns' names, or those of its head."""
+    return _Reader(table, names, parse_units(units)).read()
+
+
+def parse_units(units: str | None) -> dict[str, float]:
+    """Return the factors of the units in a text such as ``mm,deg``, by kind."""
+    given: dict[str, float] = {}
     for unit in filter(None, (units or "").replace(" ", "").split(",")):
         kind = next((kind for kind in ("length", "angle") if unit in UNITS[kind]), None)
         if kind is None:
             raise FormatError(f"'{unit}' is no unit of lengths (m, cm, mm) or angles (rad, deg).")
         given[kind] = UNITS[kind][unit]
-    names = columns.split(",") if isinstance(columns, str) else columns
-    return _Reader(table, None if names is None else [name.strip() for name in names], given).read()
+    return given
 
 
 Reading = Callable[[Array], Array]

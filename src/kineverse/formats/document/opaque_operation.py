@@ -104,7 +104,7 @@ class OpaqueOperation(Operation):
 
     def run_anew(self, model: ReadRecorder) -> Writes | None:
         """Return the writes of the operation of the library that it was; None if it was none."""
-        again = self._made_again()
+        again = self.rebuild()
         return None if again is None else again.apply(self._in_scope(model))
 
     def see(self, model: ReadRecorder) -> SeenValues:
@@ -126,7 +126,7 @@ class OpaqueOperation(Operation):
         effects = self.trace.compute_writes(results)
         return FinishedWrites(self.recorded) if writes_agree(effects.writes(), self.recorded) else effects
 
-    def _made_again(self) -> Operation | None:
+    def rebuild(self) -> Operation | None:
         """Return the operation of the library that it was, below the prefix; None for any other."""
         kind, parameters = find_class(self.kind), self.parameters
         unknown = (OpaqueRecord, UnsupportedParameter)

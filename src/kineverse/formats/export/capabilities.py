@@ -15,6 +15,7 @@ class FormatCapabilities:
     sum_limits: bool = False  # True if the format limits linear combinations of coordinates
     one_way_speeds: bool = False  # True if the velocity limits of the two directions may differ
     loop_joints: bool = False
+    keeps_urdf_elements: bool = False  # True if it writes elements again that a URDF had and no model says
     polynomial_degree: int = 1  # highest degree of the polynomials by which a joint may follow another
 
 
@@ -57,6 +58,7 @@ class UnsupportedFeatures:
     left_out: dict[str, str] = field(default_factory=dict)
     _reasons: dict[str, list[str]] = field(default_factory=dict)
     _speeds: set[str] = field(default_factory=set)
+    _motions: set[str] = field(default_factory=set)
 
     def refuse(self, name: str, reason: str) -> None:
         """Add an unsupported feature; the reason is a sentence without its subject."""
@@ -78,8 +80,18 @@ class UnsupportedFeatures:
         self._speeds.add(name)
         self.leave_out(name, reason)
 
+    def leave_out_motion(self, name: str, reason: str) -> None:
+        """Leave out the motion of a frame, which is at home in the file; refuse it in strict mode."""
+        self._motions.add(name)
+        self.leave_out(name, reason)
+
     def __bool__(self) -> bool:
         return bool(self._reasons)
+
+    @property
+    def refused(self) -> dict[str, str]:
+        """Reasons of what is refused, by name."""
+        return {name: " and ".join(reasons) for name, reasons in self._reasons.items()}
 
     @property
     def remarks(self) -> list[str]:
@@ -87,6 +99,8 @@ class UnsupportedFeatures:
         return [
             f"that '{name}' {reason} is left out: {self.target} cannot express it; its coordinates are free"
             if name in self._speeds
+            else f"'{name}' stays at home, as {self.target} cannot express its motion: it {reason}"
+            if name in self._motions
             else f"'{name}' is left out, which {self.target} cannot express: it {reason}"
             for name, reason in self.left_out.items()
         ]

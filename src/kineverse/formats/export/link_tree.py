@@ -24,6 +24,7 @@ from kineverse.formats.description import (
 )
 from kineverse.formats.names import TakenNames
 from kineverse.formats.poses import ROTATION_TOLERANCE, rotation_deviation
+from kineverse.formats.urdf.kept_elements import describe_elements, read_kept_parts
 from kineverse.intervals.graph import TermGraph
 from kineverse.loops.equations import AXES
 from kineverse.loops.loop_records import LOOP_KINDS, LoopRecord, find_loops
@@ -144,7 +145,9 @@ _UNIT_COEFFICIENTS = (IDENTITY_COEFFICIENTS, (0.0, -1.0))
 class LinkTreeBuilder:
     """Builder of the robot description of one model.
 
-    With ``loose``, frames that the format cannot move are loose links, and each link is a frame.
+    With ``loose``, frames that the format cannot move are loose links. With ``carriers``, by default unless
+    ``loose``, coordinates that are the position of no joint have a link of their own; else each link is a
+    frame.
     """
 
     def __init__(
@@ -155,9 +158,11 @@ class LinkTreeBuilder:
         tolerance: float | None = None,
         strict: bool = False,
         loose: bool = False,
+        carriers: bool | None = None,
     ) -> None:
         self.model, self.capabilities = model, target
         self._loose = loose
+        self._carriers = not loose if carriers is None else carriers
         self.unsupported = UnsupportedFeatures(target.name, strict)
         self.remarks: list[str] = []
         # Symbols of refused frames: their limits are not reported a second time.
@@ -199,7 +204,7 @@ class LinkTreeBuilder:
             for name in names
             if name in chains or self._loose
         ]
-        if not self._loose:
+        if self._carriers:
             links += self._carrier_links(chains, set(independent), links)
         description = RobotDescription(links, self.model.bodies.get(WORLD, NO_BODY), loops=self._loops)
         simple = list(self._expressible_constraints(found, approximation))
@@ -298,11 +303,12 @@ class LinkTreeBuilder:
         return result
 
     def _refuse(self, name: str, factors: Iterable[Pose | Expression], problem: str) -> None:
+        if self._loose:
+            return
         symbols = dict.fromkeys(s for f in factors if isinstance(f, Expression) for s in f.symbols)
         self._refused_symbols.update(symbols)
         moves = f"it moves with {', '.join(map(str, symbols))}" if symbols else "loops hold it where it is"
-        if not self._loose:
-            self.unsupported.refuse(name, f"{problem}; {moves}")
+        self.unsupported.refuse(name, f"{problem}; {moves}")
 
     def _factor(self, factor: Pose | Expression) -> Pose | Expression:
         if isinstance(factor, Pose):
@@ -448,8 +454,13 @@ class LinkTreeBuilder:
             )
 
     def _add_remarks(self) -> None:
-        if self.model.data:
-            self.remarks.append(f"data are not written: {list_some(self.model.data, 4)}")
+        kept = {name for name, _, _ in read_kept_parts(self.model.data)}
+        data = [name for name in self.model.data if name not in kept]
+        if data:
+            self.remarks.append(f"data are not written: {list_some(data, 4)}")
+        elements = describe_elements(self.model.data)
+        if elements and not self.capabilities.keeps_urdf_elements:
+            self.remarks.append(f"elements of URDF that say nothing of motion are not written: {elements}")
         for name in self._left_out:
             self.remarks.append(f"'{name}' is left out, as asked for")
 

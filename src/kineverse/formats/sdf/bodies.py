@@ -37,6 +37,7 @@ from kineverse.model.body import (
     Sphere,
 )
 
+from .custom_attributes import INERTIA, NAME, read_values
 from .pose_graph import PoseNode, find_pose_reference, pose_between
 
 _ROUND: dict[str, Callable[[float, float], Geometry]] = {
@@ -80,7 +81,8 @@ def _shape(element: Element, link: PoseNode) -> Shape | None:
         if reference is not None:
             link_T_shape = compose_poses(pose_between(link, reference), link_T_shape)
     color = _color(element, link) if element[0] == "visual" else None
-    return Shape(form, link_T_shape, element[1].get("name", ""), color)
+    name = element[1].get(NAME, element[1].get("name", ""))
+    return Shape(form, link_T_shape, name, color)
 
 
 def _geometry(geometry: Element, shape: Element, link: PoseNode) -> Geometry | None:
@@ -156,6 +158,8 @@ def _inertia(inertial: Element, link: PoseNode) -> Inertia | None:
     if inertial[1].get("auto", "").lower() in ("true", "1"):
         link.document.remarks.add(inertial, "is to be computed from shapes; it is left out.", link.element)
         return None
+    if not inertial[1].get(INERTIA, "given").strip():
+        return None
     mass = read_child_number(inertial, "mass", 1.0)
     pose, tensor = find_child(inertial, "pose"), find_child(inertial, "inertia")
     origin = IDENTITY if pose is None else read_element_pose(pose, link.document.remarks)
@@ -164,6 +168,10 @@ def _inertia(inertial: Element, link: PoseNode) -> Inertia | None:
         link.document.remarks.add(
             pose, "has relative_to, but an inertia is always given in its link; it is ignored.", link.element
         )
+    given = read_values(inertial, INERTIA, 7, link.document.remarks)
+    if given:
+        mass, ixx, ixy, ixz, iyy, iyz, izz = given
+        return Inertia(mass, (ixx, ixy, ixz, iyy, iyz, izz), origin)
     if tensor is None:
         return Inertia(mass, (1.0, 0.0, 0.0, 1.0, 0.0, 1.0), origin)
     ixx, ixy, ixz, iyy, iyz, izz = (

@@ -13,6 +13,8 @@ from kineverse.formats.mimic import MimicRelation
 from kineverse.formats.poses import IDENTITY
 from kineverse.model.body import NO_BODY, Body, Pose, Vector3
 
+from .custom_attributes import SdfLoop
+
 SdfJointType: TypeAlias = Literal[
     "fixed", "revolute", "continuous", "prismatic", "screw", "universal", "revolute2", "ball", "gearbox"
 ]
@@ -59,8 +61,10 @@ class SdfJoint:
 
     ``pose_in_parent`` and ``pose_in_child`` are the poses of the joint's frame in both links while all
     positions are zero. ``pitch`` [m per revolution] is that of a screw. ``gear`` is the relation of a gearbox
-    to the coordinate that drives it. ``is_reversed`` is True if parent and child were exchanged to form a
-    tree; the axes are then negated and in reverse order.
+    to the coordinate that drives it. ``frame`` is the name of the joint's frame, where that of the child is
+    another one. ``home`` are default values of its coordinates, and ``zero`` their values at the poses of the
+    file; empty for 0. ``loop`` is the loop that it closes, if the file states one. ``is_reversed`` is True if
+    parent and child were exchanged to form a tree; the axes are then negated and in reverse order.
     """
 
     name: str
@@ -72,6 +76,10 @@ class SdfJoint:
     axes: tuple[SdfAxis, ...] = ()
     pitch: float = 0.0
     gear: MimicRelation[str] | None = None
+    frame: str = ""
+    home: tuple[float, ...] = ()
+    zero: tuple[float, ...] = ()
+    loop: SdfLoop | None = None
     is_reversed: bool = False
     line: int = 0
     source: str = ""
@@ -79,12 +87,18 @@ class SdfJoint:
 
 @dataclass(frozen=True, slots=True)
 class SdfLink:
-    """Link, with its pose in the world while all positions are zero."""
+    """Link, with its pose in the world while all positions are zero.
+
+    ``free`` is the name of its free motion, if the file states one, and ``home`` are the coordinates of that
+    motion at the pose; empty for no motion.
+    """
 
     name: str
     body: Body = NO_BODY
     pose: Pose = IDENTITY
     static: bool = False
+    free: str = ""
+    home: tuple[float, ...] = ()
     line: int = 0
     source: str = ""
 

@@ -10,14 +10,15 @@ the file. If there is no hinge of the child, the gearbox becomes that hinge.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
 from kineverse.errors import suggest
 from kineverse.formats.description import DisjointSets
 from kineverse.formats.mimic import MimicRelation, is_valid_factor
-from kineverse.formats.poses import rotate_direction
+from kineverse.formats.poses import compose_poses, invert_pose, rotate_direction
+from kineverse.formats.reader_warnings import CrossedLimits
 from kineverse.formats.xml_reader import Element, ElementError, find_child, quote
 from kineverse.formats.xml_values import (
     read_axis_direction,
@@ -30,6 +31,7 @@ from kineverse.formats.xml_values import (
 )
 from kineverse.model.body import Vector3
 
+from .custom_attributes import HOME, ZERO, joint_motion, read_loop, read_values
 from .description import AXIS_COUNT, WORLD, SdfAxis, SdfJoint, SdfJointType, SdfLink, SdfRoot
 from .pose_graph import PoseNode, find_early, find_joint_end, pose_between
 
@@ -66,19 +68,55 @@ def read_sdf_joint(node: PoseNode, attachments: dict[PoseNode, PoseNode]) -> Res
         pitch = _pitch(element) if kind == "screw" else 0.0
         if kind == "ball" and find_child(element, "axis") is not None:
             axes = (_axis(node, "axis", "", kind),)
+        zero = _zero(node, kind)
+        home: tuple[float, ...] = ()
+        if kind in COORDINATE_COUNT:
+            home = read_values(element, HOME, COORDINATE_COUNT[kind], document.remarks)
+        loop = read_loop(element, document.remarks)
+    parent_T_joint = pose_between(parent, node)
+    if zero:
+        xyz, turns = (axes[0].xyz if axes else (0.0, 0.0, 1.0)), kind != "prismatic"
+        motion = joint_motion(xyz, turns, zero, pitch)
+        parent_T_joint = compose_poses(parent_T_joint, invert_pose(motion))
     joint = SdfJoint(
         node.path,
         kind,
         parent.path or "world",
         child.path,
-        pose_between(parent, node),
+        parent_T_joint,
         pose_between(child, node),
         axes,
         pitch,
+        frame=node.scope.path_of(element[1]["name"]) if node.is_renamed else node.path,
+        home=home,
+        zero=zero,
+        loop=loop,
         line=element[3],
         source=document.source,
     )
     return ResolvedJoint(joint, node, parent, child)
+
+
+COORDINATE_COUNT: Mapping[SdfJointType, int] = {
+    **dict.fromkeys(("revolute", "continuous", "prismatic", "screw"), 1),
+    "universal": 2,
+    "ball": 4,
+}
+"""Number of coordinates of a joint of each type that has a home."""
+
+
+def _zero(node: PoseNode, kind: SdfJointType) -> tuple[float, ...]:
+    """Return the values of a joint's coordinates at the poses of the file; empty for 0."""
+    if COORDINATE_COUNT.get(kind) not in (1, 4):
+        return ()
+    values = read_values(node.element, ZERO, COORDINATE_COUNT[kind], node.document.remarks)
+    return values if any(values) else ()
+
+
+def _first_zero(node: PoseNode, kind: SdfJointType) -> float:
+    """Return the value of the coordinate of a joint with one axis at the poses of the file."""
+    values = _zero(node, kind)
+    return values[0] if len(values) == 1 else 0.0
 
 
 def _kind(element: Element) -> SdfJointType:
@@ -123,8 +161,11 @@ def _axis(node: PoseNode, tag: str, suffix: str, kind: SdfJointType) -> SdfAxis:
         mistake = ElementError(
             limit, f"has lower {lower!r} above upper {upper!r}: no position would be valid."
         )
-        remarks.repair(mistake, "the joint is not limited", element)
+        crossed = partial(CrossedLimits.of, f"{node.path}{suffix}")
+        remarks.repair(mistake, "the joint is not limited", element, crossed)
         lower = upper = None
+    zero = _first_zero(node, kind)
+    lower, upper = (None if bound is None else bound + zero for bound in (lower, upper))
     values = [] if effort is None or effort < 0.0 else [("effort", effort)]
     if dynamics is not None:
         reads = ((key, partial(read_child_number, dynamics, key, 0.0)) for key in _DYNAMICS)
@@ -182,7 +223,8 @@ def _mimic(node: PoseNode, axis: Element) -> MimicRelation[str] | None:
         available = "no position" if count == 0 or kind == "gearbox" else "one axis only"
         raise ElementError(mimic, f"names {quote(name)}, which is {kind} and has {available} to follow.")
     multiplier, offset = read_child_number(mimic, "multiplier", 1.0), read_child_number(mimic, "offset", 0.0)
-    shift = offset - multiplier * read_child_number(mimic, "reference", 0.0)
+    reference = read_child_number(mimic, "reference", 0.0) + _first_zero(leader, kind)
+    shift = offset - multiplier * reference + _first_zero(node, _kind(node.element))
     return MimicRelation(leader.path + _SUFFIXES[count][which == "axis2"], multiplier, shift)
 
 
@@ -317,7 +359,7 @@ def build_spanning_tree(
         group = connected.find(link.name)
         if group not in reached and link.name not in children:
             reached.add(group)
-            roots.append(SdfRoot(link.name, free=group not in fixed))
+            roots.append(SdfRoot(link.name, free=bool(link.free) or group not in fixed))
             ordered += _outwards([link.name], joints_at, remark)
     return tuple(roots), tuple(ordered), tuple(loops)
 

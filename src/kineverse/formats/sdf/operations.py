@@ -7,19 +7,26 @@ frame is not that of its child link gets an intermediate frame of its own name.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Container, Iterator, Mapping
+from dataclasses import replace
 from typing import Any
 
 from kineverse import articulations
 from kineverse.errors import FormatError
 from kineverse.formats.description import path_between
 from kineverse.formats.names import NameMap
-from kineverse.formats.poses import IDENTITY, invert_pose, is_identity
+from kineverse.formats.poses import (
+    IDENTITY,
+    compose_poses,
+    invert_pose,
+    is_identity,
+    pose_from_quaternion,
+)
 from kineverse.formats.urdf.operations import AXIS_JOINTS
 from kineverse.formats.xml_reader import quote
 from kineverse.loops.close_loop import CloseLoop
 from kineverse.loops.equations import AXES
-from kineverse.model.basic_operations import AddFrame, SetBody
+from kineverse.model.basic_operations import AddFrame, SetBody, SetHome
 from kineverse.model.body import is_empty_body
 from kineverse.model.frame import WORLD as MODEL_WORLD
 from kineverse.model.frame import Frame
@@ -50,14 +57,13 @@ def sdf_operations(scene: SdfScene, prefix: str | None = None) -> Iterator[Opera
 
     _check_names(scene)
     bodies = {link.name: link.body for link in scene.links if not is_empty_body(link.body)}
-    poses = {link.name: link.pose for link in scene.links}
+    links = {link.name: link for link in scene.links}
     for root in scene.roots:
         name = model_name(root.link)
         if root.free:
-            free = f"{name}/free"
-            yield articulations.Floating(name=free, parent=MODEL_WORLD, child=name, origin=poses[root.link])
+            yield from _free_motion(links[root.link], name, model_name)
         else:
-            yield AddFrame(name, Frame(MODEL_WORLD, (poses[root.link],)))
+            yield AddFrame(name, Frame(MODEL_WORLD, (links[root.link].pose,)))
         if root.link in bodies:
             yield SetBody(name, bodies[root.link])
     for joint in scene.joints:
@@ -67,8 +73,23 @@ def sdf_operations(scene: SdfScene, prefix: str | None = None) -> Iterator[Opera
     for frame in scene.frames:
         yield AddFrame(model_name(frame.name), Frame(model_name(frame.parent), (frame.pose,)))
     above = {joint.child: joint for joint in scene.joints}
+    closing: dict[str, list[SdfJoint]] = {}
     for joint in scene.loops:
-        yield from _loop(joint, model_name, _home(joint, above, model_name))
+        name = f"{joint.name}/loop" if joint.loop is None else joint.loop.name
+        closing.setdefault(name, []).append(joint)
+    dependent: set[str] = set()
+    for joints in closing.values():
+        # Ends that close one loop together have the same rows; others are loops of their own.
+        together = [joint for joint in joints if (joint.kind == "ball") == (joints[0].kind == "ball")]
+        alone = [replace(joint, loop=None) for joint in joints if joint not in together]
+        for group in (together, *([joint] for joint in alone)):
+            home = _home(group, above, dependent)
+            placed = tuple((symbol_name(model_name(name), 0), value) for name, value in home.items())
+            yield from _loop(group, model_name, placed)
+            dependent |= set(group[0].loop.dependent or ()) if group[0].loop else set()
+    for joint in scene.joints:
+        if joint.home and joint.name not in dependent and not any(axis.mimic for axis in joint.axes):
+            yield SetHome(model_name(joint.name), joint.home)
 
 
 def _tree_joint(joint: SdfJoint, model_name: NameMap) -> Iterator[Operation]:
@@ -76,33 +97,67 @@ def _tree_joint(joint: SdfJoint, model_name: NameMap) -> Iterator[Operation]:
     if is_identity(joint.pose_in_child):
         yield from _motions(joint, model_name, model_name(joint.child))
         return
-    between, link = model_name(joint.name), model_name(joint.child)
+    between, link = model_name(joint.frame or joint.name), model_name(joint.child)
     yield from _motions(joint, model_name, between)
     yield AddFrame(link, Frame(between, (invert_pose(joint.pose_in_child),)))
 
 
+def _free_motion(link: SdfLink, name: str, model_name: NameMap) -> Iterator[Operation]:
+    """Yield the free motion of a link, from the pose in the file or from where its home leads to that."""
+    free, origin = model_name(link.free) if link.free else f"{name}/free", link.pose
+    if link.home:
+        xyz, quaternion = link.home[:3], link.home[3:]
+        origin = compose_poses(origin, invert_pose(pose_from_quaternion(xyz, quaternion)))
+    yield articulations.Floating(name=free, parent=MODEL_WORLD, child=name, origin=origin)
+    if link.home:
+        yield SetHome(free, link.home)
+
+
 def _home(
-    loop: SdfJoint, above: Mapping[str, SdfJoint], model_name: NameMap
-) -> tuple[tuple[str, float], ...]:
-    """Return the home position of the quaternions in a loop; its other coordinates are 0."""
+    closing: list[SdfJoint], above: Mapping[str, SdfJoint], dependent: Container[str]
+) -> dict[str, float]:
+    """Return the coordinates in a loop that are not 0 where the file closes it, but for dependent ones."""
     parents = {link: joint.parent for link, joint in above.items()}
-    joints = [above[link] for link in path_between(loop.parent, loop.child, parents)]
-    return tuple(
-        (symbol_name(f"{model_name(joint.name)}/qw", 0), 1.0) for joint in joints if joint.kind == "ball"
+    names = (link for joint in closing for link in path_between(joint.parent, joint.child, parents))
+    home: dict[str, float] = {}
+    for joint in (above[link] for link in dict.fromkeys(names)):
+        if joint.kind == "ball":
+            values = joint.zero or joint.home or (0.0, 0.0, 0.0, 1.0)
+            pairs = zip(("qx", "qy", "qz", "qw"), values, strict=True)
+            home |= {f"{joint.name}/{key}": value for key, value in pairs if value}
+        elif len(joint.axes) == 1 and joint.zero and joint.axes[0].mimic is None:
+            home[joint.name] = joint.zero[0]
+    return {name: value for name, value in home.items() if name not in dependent}
+
+
+def _loop(
+    closing: list[SdfJoint], model_name: NameMap, home: tuple[tuple[str, float], ...]
+) -> Iterator[Operation]:
+    """Yield the operations of joints to frames of their own, and of the loop that closes there.
+
+    A joint that states its loop closes it together with others.
+    """
+    pairs = []
+    for joint in closing:
+        name = model_name(joint.frame or joint.name)
+        if joint.kind in ("ball", "fixed"):
+            yield AddFrame(name, Frame(model_name(joint.parent), (joint.pose_in_parent,)))
+        else:
+            yield from _motions(joint, model_name, name)
+        yield AddFrame(f"{name}/closed", Frame(model_name(joint.child), (joint.pose_in_child,)))
+        pairs.append((f"{name}/closed", name))
+    first = closing[0]
+    stated = first.loop.dependent if first.loop else None
+    (frame, to), *more = pairs
+    yield CloseLoop(
+        name=model_name(first.loop.name) if first.loop else f"{model_name(first.name)}/loop",
+        frame=frame,
+        to=to,
+        more=tuple(more),
+        mask=AXES[:3] if first.kind == "ball" else AXES,
+        dependent=None if stated is None else tuple(symbol_name(model_name(one), 0) for one in stated),
+        home=home,
     )
-
-
-def _loop(joint: SdfJoint, model_name: NameMap, home: tuple[tuple[str, float], ...]) -> Iterator[Operation]:
-    """Yield the operations of a joint to a frame of its own, and of the loop that closes it at the link."""
-    name = model_name(joint.name)
-    closed, loop = f"{name}/closed", f"{name}/loop"
-    ball = joint.kind == "ball"
-    if ball or joint.kind == "fixed":
-        yield AddFrame(name, Frame(model_name(joint.parent), (joint.pose_in_parent,)))
-    else:
-        yield from _motions(joint, model_name, name)
-    yield AddFrame(closed, Frame(model_name(joint.child), (joint.pose_in_child,)))
-    yield CloseLoop(name=loop, frame=closed, to=name, mask=AXES[:3] if ball else AXES, home=home)
 
 
 def _motions(joint: SdfJoint, model_name: NameMap, child: str) -> Iterator[Operation]:
@@ -196,10 +251,10 @@ def _check_names(scene: SdfScene) -> None:
     free = {root.link for root in scene.roots if root.free}
     for link in scene.links:
         if link.name in free:
-            take(articulations, f"{link.name}/free", "the free motion of the link", link)
+            take(articulations, link.free or f"{link.name}/free", "the free motion of the link", link)
     for joint in (*scene.joints, *scene.loops):
         take(articulations, joint.name, "the joint", joint)
         for axis in joint.axes if len(joint.axes) == 2 else ():
             take(articulations, joint.name + axis.suffix, f"the {axis.suffix[1:]} axis", joint)
         if joint in scene.loops or not is_identity(joint.pose_in_child):
-            take(frames, joint.name, "the frame of the joint", joint)
+            take(frames, joint.frame or joint.name, "the frame of the joint", joint)

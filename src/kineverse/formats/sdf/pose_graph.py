@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from typing import Literal, NoReturn, TypeAlias
 
 from kineverse.errors import suggest
+from kineverse.formats.names import drop_empty_parts
 from kineverse.formats.poses import IDENTITY, compose_poses, invert_pose
 from kineverse.formats.reader_warnings import ReaderWarnings
 from kineverse.formats.root_folder import NOWHERE
@@ -78,6 +79,7 @@ class PoseNode:
     world_pose: Pose | None = None
     depth: int = 0
     is_named_frame: bool = True  # True if the element becomes a frame of the model
+    is_renamed: bool = False  # True if the element states its name in the model
 
     @property
     def document(self) -> SdfDocument:
@@ -113,8 +115,11 @@ class SdfScope:
 
     def path_of(self, name: str) -> str:
         """Return the path of a name of this scope."""
-        parts = [part for piece in name.split("::") for part in piece.split("/") if part]
-        return "/".join([self.path, *parts] if self.path else parts)
+        return self.path_of_model_name("/".join(name.split("::")))
+
+    def path_of_model_name(self, name: str) -> str:
+        """Return the path of a name as it is in the model, where colons do not separate scopes."""
+        return drop_empty_parts(f"{self.path}/{name}")
 
     def find(self, name: str, element: Element, owner: Element) -> PoseNode:
         """Return the node that a name refers to."""

@@ -21,6 +21,7 @@ from kineverse.formats.xml_reader import Element, ElementError, find_child, pars
 from kineverse.formats.xml_values import read_attribute_bool, read_child_bool, read_child_text, read_text
 
 from .bodies import read_sdf_body
+from .custom_attributes import FREE, HOME, NAME, read_given_name, read_values
 from .description import WORLD, SdfFrame, SdfJoint, SdfLink, SdfScene
 from .include import find_included, read_urdf_as_sdf
 from .joints import build_spanning_tree, read_sdf_joint, resolve_gearboxes
@@ -201,7 +202,10 @@ class SdfModelReader:
             while name in scope.names:
                 name += "_"
             scope.document.remarks.add(element, f"{again}; {quote(old)} is called {quote(name)} here.")
-        node = PoseNode(kind, scope.path_of(name), scope, element, find_child(element, "pose"), scope)
+        given = read_given_name(element, NAME, scope.document.remarks)
+        path = scope.path_of_model_name(given) if given else scope.path_of(name)
+        node = PoseNode(kind, path, scope, element, find_child(element, "pose"), scope)
+        node.is_renamed = bool(given)
         scope.names[name] = node
         self._graph.nodes.append(node)
         return node
@@ -385,8 +389,18 @@ def _check_leaders(joints: Sequence[SdfJoint], nodes: dict[str, PoseNode]) -> No
 
 def _link(node: PoseNode) -> SdfLink:
     assert node.world_pose is not None
-    static, document = node.scope.static, node.document
-    return SdfLink(node.path, read_sdf_body(node), node.world_pose, static, node.element[3], document.source)
+    document, element = node.document, node.element
+    free = read_given_name(element, FREE, document.remarks)
+    return SdfLink(
+        node.path,
+        read_sdf_body(node),
+        node.world_pose,
+        node.scope.static,
+        node.scope.path_of_model_name(free) if free else "",
+        read_values(element, HOME, 7, document.remarks) if free else (),
+        element[3],
+        document.source,
+    )
 
 
 def _resolve_mimic_chains(joints: list[SdfJoint], nodes: dict[str, PoseNode]) -> list[SdfJoint]:

@@ -39,6 +39,7 @@ from kineverse.model.body import (
 )
 
 from .description import UrdfLink
+from .kept_elements import KeptMaterial
 
 Appearance: TypeAlias = tuple[Rgba | None, str]  # colour or None, and the file of the texture or ""
 
@@ -51,11 +52,13 @@ class UrdfMaterials:
     def __init__(self, remarks: ReaderWarnings):
         self._remarks = remarks
         self._shared: dict[str, Appearance] = {}
+        self.defined: list[KeptMaterial] = []
         self._local: dict[str, Appearance] = {}
 
     def define(self, material: Element) -> None:
         """Define a material of the robot."""
         appearance = self._read(material, material)
+        self.defined.append(KeptMaterial(material[1].get("name", ""), *appearance))
         if appearance == _NO_APPEARANCE:
             return
         earlier = self._shared.setdefault(material[1].get("name", ""), appearance)
@@ -128,6 +131,7 @@ class UrdfLinkReader:
         self._folder, self._root, self._real_path = folder, root, RealPaths()
         self._version = version
         self._remarks = remarks
+        self.visual_materials: dict[str, dict[int, tuple[str, bool]]] = {}
         self._undefined_materials: list[tuple[str, int, Element, Element]] = []
 
     def read(self, element: Element) -> UrdfLink:
@@ -178,6 +182,9 @@ class UrdfLinkReader:
         pose, own_name = read_origin(origin, link, self._version, self._remarks), element[1].get("name", "")
         if material is None or index < 0:
             return Shape(form, pose, own_name)
+        named = material[1].get("name", "")
+        if named:
+            self.visual_materials.setdefault(name, {})[index] = named, bool(material[2])
         appearance = self.materials.appearance(material, link)
         if appearance is None:
             self._undefined_materials.append((name, index, material, link))

@@ -14,6 +14,8 @@ from kineverse.formats.mimic import MimicRelation
 from kineverse.formats.poses import IDENTITY
 from kineverse.model.body import NO_BODY, Body, Pose, Vector3
 
+from .kept_elements import KeptParts
+
 UrdfJointType: TypeAlias = Literal[
     "fixed", "revolute", "continuous", "prismatic", "planar", "floating", "spherical"
 ]
@@ -124,7 +126,7 @@ class UrdfRobot(Struct, frozen=True):
     ``links`` are in the order of the file. ``joints`` are ordered from the ``root`` outwards, each after the
     joint of its parent link. ``more_roots`` are further links without parent, in files that are no tree;
     their pose is that of the root. ``remarks`` are warnings about ignored or ambiguous elements, each with
-    its line.
+    its line. ``kept`` are the parts that say nothing of motion.
     """
 
     name: str
@@ -134,6 +136,7 @@ class UrdfRobot(Struct, frozen=True):
     source: str = ""
     remarks: tuple[str, ...] = ()
     more_roots: tuple[str, ...] = ()
+    kept: KeptParts | None = None
 
     @property
     def dof(self) -> int:

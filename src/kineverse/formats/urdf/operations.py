@@ -12,6 +12,8 @@ from collections.abc import Callable, Container, Iterable, Iterator
 from dataclasses import replace
 from typing import Any
 
+from msgspec import structs
+
 from kineverse import articulations
 from kineverse.articulations import Continuous, Fixed, OneDofJoint, Planar, Prismatic, Revolute
 from kineverse.articulations import Joint as JointOperation
@@ -19,7 +21,7 @@ from kineverse.errors import FormatError
 from kineverse.formats.names import NumberedNames, drop_empty_parts
 from kineverse.formats.reader_warnings import Fault, warn
 from kineverse.formats.xml_reader import quote
-from kineverse.model.basic_operations import AddFrame, SetBody, SoftLimits
+from kineverse.model.basic_operations import AddFrame, SetBody, SetData, SoftLimits
 from kineverse.model.body import Pose, is_empty_body
 from kineverse.model.frame import WORLD, Frame
 from kineverse.model.operation import Operation
@@ -28,6 +30,7 @@ from kineverse.shipped.robots import joint_spring, mobile_base
 from kineverse.symbols import position
 
 from .description import UrdfJoint, UrdfLink, UrdfRobot
+from .kept_elements import DATUM
 from .reader import parse_urdf
 
 AXIS_JOINTS: dict[str, type[OneDofJoint]] = {
@@ -71,7 +74,7 @@ def urdf_operations(
     robot: UrdfRobot, prefix: str | None = None, parent: str = WORLD, strict: bool = False
 ) -> Iterator[Operation]:
     """Yield the operations that build a robot, from its root outwards."""
-    links, joints = _assign_names(robot, prefix, strict)
+    links, joints = assign_names(robot, prefix, strict)
 
     def frame_name(name: str) -> str:
         return f"{prefix}/{links[name]}" if prefix else links[name]
@@ -98,6 +101,12 @@ def urdf_operations(
         yield from _joint_operations(joint, frame_name, joint_name)
         if joint.child in bodies:
             yield SetBody(frame_name(joint.child), bodies[joint.child])
+    # The world is in many models, so its first child names what is kept of a robot that begins there.
+    anchors = [robot.root] if root != WORLD else [joint.child for joint in robot.joints]
+    if robot.kept is not None and anchors:
+        changed = {k: v for k, v in {**links, **joints}.items() if v != drop_empty_parts(k)}
+        kept = structs.replace(robot.kept, anchor=links[anchors[0]], renamed=tuple(changed.items()))
+        yield SetData(f"{frame_name(anchors[0])}/{DATUM}", kept.as_datum())
 
 
 def _joint_operations(
@@ -140,9 +149,7 @@ def _dynamics(joint: UrdfJoint) -> tuple[tuple[str, float], ...]:
     return tuple((name, value) for name, value in values.items() if value is not None)
 
 
-def _assign_names(
-    robot: UrdfRobot, prefix: str | None, strict: bool
-) -> tuple[dict[str, str], dict[str, str]]:
+def assign_names(robot: UrdfRobot, prefix: str | None, strict: bool) -> tuple[dict[str, str], dict[str, str]]:
     """Return the names of links and joints in the model; invalid and repeated names are replaced."""
     numbers = NumberedNames()
 

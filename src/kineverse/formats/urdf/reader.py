@@ -12,19 +12,20 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TypeVar
 
-from msgspec.structs import replace
+from msgspec import structs
 
 from kineverse.errors import FormatError, list_some, suggest
 from kineverse.formats.files import read_file
 from kineverse.formats.names import NumberedNames
 from kineverse.formats.reader_warnings import ReaderWarnings
 from kineverse.formats.root_folder import find_text_root
-from kineverse.formats.xml_reader import Element, ElementError, Visit, label, parse_xml, quote
+from kineverse.formats.xml_reader import Element, ElementError, Visit, decode_xml, label, parse_xml, quote
 from kineverse.model.frame import WORLD
 
 from .bodies import UrdfLinkReader
 from .description import UrdfJoint, UrdfLink, UrdfRobot
 from .joints import read_urdf_joint, resolve_mimic_joints
+from .kept_elements import KeptElement, KeptParts, find_elements, find_occurring, has_unknown_parts
 
 _VERSIONS = {"1.0": (1, 0), "1.1": (1, 1), "1.2": (1, 2)}
 _EXTENSIONS = frozenset(("gazebo", "transmission"))
@@ -89,6 +90,7 @@ def parse_urdf(
     links = tuple(document.links.values())
     roots, ordered, reached = order_from_root(links, joints, remarks, hint)
     name = top[1].get("name", "")
+    kept = document.kept_parts(text, top)
     return UrdfRobot(
         name,
         roots[0],
@@ -97,6 +99,7 @@ def parse_urdf(
         source,
         tuple(remarks.texts),
         roots[1:],
+        kept,
     )
 
 
@@ -107,6 +110,8 @@ class _Document:
         self.remarks = remarks
         self._folder, self._root = folder, root
         self._unknown_elements: list[Element] = []
+        self._has_unknown_parts = False
+        self._owners: set[tuple[str, str]] = set()  # links and joints that have unknown parts
         self._numbers = NumberedNames()
 
     def begin(self, root: Element) -> Visit:
@@ -133,11 +138,32 @@ class _Document:
             raise empty.located(self.remarks.source)
         return hint
 
+    def kept_parts(self, text: str | bytes, top: Element) -> KeptParts:
+        """Return the parts of the document that its links and joints do not say."""
+        visuals = (
+            (link, tuple(found.get(k, ("", False)) for k in range(max(found) + 1)))
+            for link, found in self._reader.visual_materials.items()
+        )
+        elements: tuple[KeptElement, ...] = ()
+        namespaces = tuple((k, v) for k, v in top[1].items() if k.startswith("xmlns:"))
+        if self._has_unknown_parts or any(_mentions(text, tag) for tag in _EXTENSIONS):
+            plain = decode_xml(text)
+            if plain is None:
+                self.remarks.add(top, "is in no encoding whose extensions can be kept; they are left out.")
+            else:
+                elements = tuple(find_elements(plain, self._owners, self._xacro))
+        names = find_occurring(elements, dict.fromkeys((*self.links, *self.joints))) if elements else ()
+        kept = KeptParts(top[1].get("name", ""), "", namespaces, tuple(self._reader.materials.defined))
+        return structs.replace(kept, visuals=tuple(visuals), elements=elements, names=names)
+
     def _read_element(self, element: Element) -> None:
         tag = element[0]
         try:
             if tag in ("link", "joint"):
                 _check_expanded(element, self._xacro, self.remarks)
+                if has_unknown_parts(element):
+                    self._has_unknown_parts = True
+                    self._owners.add((tag, element[1].get("name", "")))
             if tag == "link":
                 link = self._reader.read(element)
                 _add(self.links, link.name, link, element)
@@ -145,8 +171,10 @@ class _Document:
                 self._add_joint(read_urdf_joint(element, self._version, self.remarks), element)
             elif tag == "material":
                 self._reader.materials.define(element)
-            elif tag != "sensor":
-                self._unknown_elements.append(element)
+            else:
+                self._has_unknown_parts = True
+                if tag != "sensor":
+                    self._unknown_elements.append(element)
         except ElementError as mistake:
             raise mistake.located(self.remarks.source, element) from None
 
@@ -163,7 +191,11 @@ class _Document:
         self.remarks.repair(mistake, f'the fixed one is called "{fixed}"')
         if other.kind == "fixed" and joint.kind != "fixed":
             self.joints[name], joint = joint, other
-        self.joints[fixed] = replace(joint, name=fixed)
+        self.joints[fixed] = structs.replace(joint, name=fixed)
+
+
+def _mentions(text: str | bytes, tag: str) -> bool:
+    return f"<{tag}" in text if isinstance(text, str) else f"<{tag}".encode() in text.replace(b"\0", b"")
 
 
 def _add(by_name: dict[str, T], name: str, part: T, element: Element) -> None:

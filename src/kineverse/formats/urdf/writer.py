@@ -17,9 +17,7 @@ from typing import Any
 import numpy as np
 from msgspec.structs import replace
 
-from kineverse._runtime import no_collection
 from kineverse.articulations.multi_axis import rotation_from_z
-from kineverse.errors import FormatError, KineverseError
 from kineverse.formats.description import (
     IDENTITY_COEFFICIENTS,
     BallJointDescription,
@@ -29,12 +27,13 @@ from kineverse.formats.description import (
     Matrix,
     RobotDescription,
     WrittenFile,
+    dynamics_number,
 )
 from kineverse.formats.export.capabilities import FormatCapabilities, UnsupportedFeatures
 from kineverse.formats.export.link_tree import LinkTreeBuilder, check_rotation
+from kineverse.formats.loader import check_readable
 from kineverse.formats.names import TakenNames
 from kineverse.formats.poses import IDENTITY, ROTATION_TOLERANCE, rpy_angles
-from kineverse.formats.reader_warnings import collect_warnings
 from kineverse.formats.resource_paths import mesh_reference
 from kineverse.formats.xml_writer import Tag, format_xml
 from kineverse.lie import translation
@@ -49,16 +48,15 @@ from kineverse.model.body import (
     Geometry,
     Mesh,
     Pose,
+    Rgba,
     Shape,
     Sphere,
 )
 from kineverse.model.frame import WORLD
-from kineverse.model.model import Model
 from kineverse.model.model_view import ModelView
 from kineverse.symbols import Symbol
 
-from .operations import urdf_operations
-from .reader import parse_urdf
+from .kept_elements import KeptPartsWriter
 
 _TENSOR = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 
@@ -66,10 +64,12 @@ _TENSOR = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 class UrdfBodyWriter:
     """Writer of the bodies of one file."""
 
-    def __init__(self, folder: Path, remarks: list[str]) -> None:
+    def __init__(self, folder: Path, remarks: list[str], kept: KeptPartsWriter) -> None:
         self._folder = folder
         self._remarks = remarks
+        self._kept = kept
         self._materials: dict[object, str] = {}
+        self._appearances: dict[str, tuple[Rgba | None, str]] = {}
 
     def write(self, link: Tag, body: Body) -> None:
         """Add the elements of a body to its link."""
@@ -79,10 +79,10 @@ class UrdfBodyWriter:
             add_origin(element, body.inertia.origin)
             element.add("mass", value=body.inertia.mass)
             element.add("inertia", **dict(zip(_TENSOR, body.inertia.tensor, strict=True)))
-        for shape in body.visuals:
+        for k, shape in enumerate(body.visuals):
             visual = self._shape(link, "visual", shape, name)
             if visual is not None:
-                self._material(visual, shape)
+                self._material(visual, shape, *self._kept.visual_material(name, k))
         for shape in body.collisions:
             self._shape(link, "collision", shape, name)
             if shape.color is not None or shape.texture:
@@ -110,16 +110,42 @@ class UrdfBodyWriter:
             scale = None if form.scale == (1.0, 1.0, 1.0) else form.scale
             element.add("mesh", filename=mesh_reference(form, self._folder, self._remark), scale=scale)
 
-    def _material(self, visual: Tag, shape: Shape) -> None:
-        if shape.color is None and not shape.texture:
+    def define_materials(self, root: Tag, bodies: Iterable[Body]) -> None:
+        """Add the materials that the file that was read defined for the whole robot."""
+        textured = {s.texture: s for body in bodies for s in body.visuals if s.texture}
+        for material in self._kept.materials:
+            element = root.add("material", name=material.name)
+            look = material.color, material.texture
+            shape = textured.get(material.texture, Shape(Mesh(""), texture=material.texture))
+            self._define(element, material.color, shape)
+            if look != (None, ""):
+                self._appearances[material.name] = look
+
+    def _material(self, visual: Tag, shape: Shape, name: str, is_defined: bool) -> None:
+        look = shape.color, shape.texture
+        if name and self._appearances.get(name, look) == look:
+            element = visual.add("material", name=name)
+            # What no element before has defined is defined here: that element may be gone.
+            if is_defined or (name not in self._appearances and look != (None, "")):
+                self._define(element, shape.color, shape)
+                self._appearances[name] = look
+            return
+        if look == (None, ""):
             return
         folder = shape.geometry.folder if shape.texture and isinstance(shape.geometry, Mesh) else ""
         key = shape.color, shape.texture, folder
         # Equal materials share a name; different materials of one name are an error for some readers.
-        name = self._materials.setdefault(key, f"material_{len(self._materials) + 1}")
-        material = visual.add("material", name=name)
-        if shape.color is not None:
-            material.add("color", rgba=shape.color)
+        if key not in self._materials:
+            taken = {*self._appearances, *self._materials.values()}
+            number = len(self._materials) + 1
+            while f"material_{number}" in taken:
+                number += 1
+            self._materials[key] = f"material_{number}"
+        self._define(visual.add("material", name=self._materials[key]), shape.color, shape)
+
+    def _define(self, material: Tag, color: Rgba | None, shape: Shape) -> None:
+        if color is not None:
+            material.add("color", rgba=color)
         if shape.texture:
             material.add("texture", filename=self._texture(shape))
 
@@ -145,7 +171,7 @@ def add_origin(element: Tag, pose: Pose) -> None:
     element.add("origin", xyz=matrix[:3, 3].tolist(), rpy=None if rpy == (0.0, 0.0, 0.0) else rpy)
 
 
-URDF_CAPABILITIES = FormatCapabilities("URDF")
+URDF_CAPABILITIES = FormatCapabilities("URDF", keeps_urdf_elements=True)
 LARGEST_FLOAT = sys.float_info.max  # number written in place of no limit, where URDF requires a number
 
 _NEWER = ("acceleration", "deceleration", "jerk")
@@ -170,8 +196,9 @@ def to_urdf(
     description = builder.build()
     if loose:
         _loosen_links(description)
-    content = UrdfWriter(description, path, builder.unsupported).document()
-    _check_read_back(content, path)
+    kept = KeptPartsWriter({} if loose else model.data)
+    content = UrdfWriter(description, path, builder.unsupported, kept).document()
+    check_readable(content, path)
     return WrittenFile(content, tuple(description.remarks), description.errors, builder.unsupported.left_out)
 
 
@@ -190,38 +217,36 @@ def _loosen_links(description: RobotDescription) -> None:
             link.is_loose = True
 
 
-def _check_read_back(content: bytes, path: Path) -> None:
-    model = Model()
-    try:
-        with collect_warnings(), model.edit() as edit, no_collection():
-            robot = parse_urdf(content, path.name, str(path.absolute().parent))
-            for operation in urdf_operations(robot):
-                edit.apply(operation)
-    except KineverseError as error:
-        raise FormatError(f"What would be written cannot be read again: {error}") from error
-
-
 class UrdfWriter:
     """Writer of one robot description as URDF."""
 
-    def __init__(self, description: RobotDescription, path: Path, unsupported: UnsupportedFeatures) -> None:
+    def __init__(
+        self,
+        description: RobotDescription,
+        path: Path,
+        unsupported: UnsupportedFeatures,
+        kept: KeptPartsWriter,
+    ) -> None:
+        self._kept = kept
         self._description, self._path, self._unsupported = description, path, unsupported
         self._links = TakenNames([WORLD, *(link.name for link in description.links)])
         fixed = [link.fixed_joint_name for link in description.links]
         self._joints = TakenNames([*fixed, *(joint.name for joint in description.joints)])
-        self._bodies = UrdfBodyWriter(path.absolute().parent, description.remarks)
-        self._root = Tag("robot", {"name": path.name.removesuffix(path.suffix) or "model"})
+        self._bodies = UrdfBodyWriter(path.absolute().parent, description.remarks, kept)
+        name = kept.robot or path.name.removesuffix(path.suffix) or "model"
+        self._root = Tag("robot", {"name": name, **kept.namespaces})
 
     def document(self) -> bytes:
         """Return the text of the file."""
         links = self._description.links
         root = self._root_link()
+        self._bodies.define_materials(self._root, [self._description.world_body, *(k.body for k in links)])
         if root is None:
             self._bodies.write(self._root.add("link", name=WORLD), self._description.world_body)
         for link in links:
             self._link(link, link is root)
         self._unsupported.check(self._path.name)
-        self._description.remarks += self._unsupported.remarks
+        self._description.remarks += [*self._kept.add_elements(self._root), *self._unsupported.remarks]
         self._root.give("version", self._version())
         return format_xml(self._root, [*self._description.remarks, *self._description.error_lines])
 
@@ -355,15 +380,19 @@ class UrdfWriter:
         self, element: Tag, name: str, known: Mapping[str, Any], soft: tuple[float, float] | None = None
     ) -> None:
         if known.get("damping") or known.get("friction"):
-            element.add("dynamics", damping=_number(known, "damping"), friction=_number(known, "friction"))
+            element.add(
+                "dynamics",
+                damping=dynamics_number(known, "damping"),
+                friction=dynamics_number(known, "friction"),
+            )
         if soft is not None or "k_velocity" in known:
             lower, upper = soft or (None, None)
             element.add(
                 "safety_controller",
                 soft_lower_limit=lower,
                 soft_upper_limit=upper,
-                k_position=_number(known, "k_position"),
-                k_velocity=_number(known, "k_velocity") or 0.0,
+                k_position=dynamics_number(known, "k_position"),
+                k_velocity=dynamics_number(known, "k_velocity") or 0.0,
             )
         for key in known:
             if key not in _KNOWN:
@@ -372,8 +401,8 @@ class UrdfWriter:
     def _limit(
         self, element: Tag, name: str, kind: str, bounds: JointBounds, known: Mapping[str, Any]
     ) -> None:
-        effort, max_velocity = _number(known, "effort"), bounds.max_velocity
-        newer = {key: _number(known, key) for key in _NEWER}
+        effort, max_velocity = dynamics_number(known, "effort"), bounds.max_velocity
+        newer = {key: dynamics_number(known, key) for key in _NEWER}
         has_range = kind in ("revolute", "prismatic") or not bounds.is_unbounded
         if not has_range and effort is None and max_velocity == math.inf and not any(newer.values()):
             return
@@ -404,8 +433,3 @@ class UrdfWriter:
 
 def _axis_key(joint: JointDescription) -> tuple[str, bool, tuple[float, ...]]:
     return joint.name, joint.is_rotation, joint.axis
-
-
-def _number(dynamics: object, key: str) -> float | None:
-    value = dynamics.get(key) if isinstance(dynamics, dict) else None
-    return float(value) if isinstance(value, (int, float)) and not math.isnan(value) else None

@@ -1,0 +1,356 @@
+"""Robust least squares of all residual blocks: Gauss-Newton steps, outliers, and sizes of the noise.
+
+The first steps weigh observations by a Cauchy density whose scale is the median of the residuals, from which
+a start far away and a share of gross errors below one half converge. Then the mixture of
+:class:`.Outliers` weighs them, and the sizes of the noise are those at which the weighted residuals of each
+group have the variance expected with its share of the degrees of freedom (restricted maximum likelihood),
+with the prior of unknown noise that identification has.
+
+Parameters are scaled by their prior sizes. In a direction that the data tell less well than its prior size,
+steps are zero: so it stays where it was.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from kineverse.errors import InvalidValueError, NoSolutionError
+from kineverse.estimation.noise import NOISE_SPREAD, Outliers
+from kineverse.estimation.tracking.residuals import whitening
+from kineverse.lie import Array
+
+from .observations import ResidualBlock
+
+FINEST = 1e-7  # smallest standard deviation of an estimated noise [m], [rad]; below it rounding is larger
+_ROUNDING = 1e-14  # relative size of an eigenvalue of JᵀJ that is rounding
+_ROUGH, _STEPS, _HALVINGS = 40, 60, 8  # largest numbers of steps before and with the mixture, of halvings
+_SETTLED = 1e-8  # squared length of a step at convergence, in standard deviations
+_NEAR = 1e-2  # the same of the last step before the mixture
+_EVEN = 1e-3  # relative change of the sizes of noise at convergence
+
+
+class Linearised(NamedTuple):
+    """Residuals (N, m) and Jacobians (N, m, p) of a block, in scaled parameters."""
+
+    residual: Array
+    jacobian: Array
+
+
+@dataclass
+class Weighted:
+    """Normal equations H x = g of weighted residuals, with the parts that each group contributes to H."""
+
+    hessian: Array
+    gradient: Array
+    parts: dict[str, Array]
+
+
+@dataclass
+class CalibrationFit:
+    """Fitted parameters, in units of their prior sizes."""
+
+    values: Array  # (p,)
+    noise: dict[str, float]  # standard deviation of each group; 1 for a stated one
+    weights: list[Array]  # inlier probability of each observation, by block
+    linear: list[Linearised]  # at the values
+    hessian: Array
+    rank: int
+
+
+class CalibrationProblem:
+    """Blocks of residuals as a function of all scaled parameters."""
+
+    def __init__(
+        self,
+        blocks: Sequence[ResidualBlock],
+        columns: Sequence[Sequence[int]],  # of each block's parameters
+        scales: Array,  # prior sizes, (p,)
+        stated: Mapping[str, float],  # sizes of the noise that are known, by group
+        outliers: Outliers | None,
+    ) -> None:
+        self.blocks, self.scales, self.outliers = list(blocks), scales, outliers
+        self.columns = [np.asarray(c, dtype=int) for c in columns]
+        self.whiten = [None if b.covariance is None else whitening(b.covariance) for b in blocks]
+        self.log_volumes = [
+            0.0 if w is None else -np.linalg.slogdet(w)[1] for w in self.whiten
+        ]  # ½ log |S| of stated covariances
+        self.log_outlier = [0.0 if outliers is None else b.log_outlier_density(outliers) for b in blocks]
+        sized = [block for block, w in zip(blocks, self.whiten, strict=True) if w is None]
+        groups = [group for block in sized for group in block.groups]
+        self.known = {group.name: stated[group.name] for group in groups if group.name in stated}
+        self.unknown = sorted({group.name for group in groups} - self.known.keys())
+        self.medians = {group.name: group.median for group in groups if group.median is not None}
+
+    def linearise(self, values: Array) -> list[Linearised]:
+        """Return residuals and Jacobians of all blocks at scaled values."""
+        full = values * self.scales
+        result = []
+        for block, columns, whiten in zip(self.blocks, self.columns, self.whiten, strict=True):
+            residual, jacobian = block.evaluate(full[columns])
+            if whiten is not None:
+                residual = (whiten @ residual[..., None])[..., 0]
+                jacobian = whiten @ jacobian
+            result.append(Linearised(residual, jacobian * self.scales[columns]))
+        return result
+
+    def deviations(self, index: int, noise: Mapping[str, float]) -> Array:
+        """Return the standard deviation of each row of a block's residuals, (m,)."""
+        block = self.blocks[index]
+        if self.whiten[index] is not None:
+            return np.ones(1)
+        return np.concatenate([np.full(g.rows.stop - g.rows.start, noise[g.name]) for g in block.groups])
+
+    def squares(self, linear: Sequence[Linearised], noise: Mapping[str, float]) -> list[Array]:
+        """Return the squared norms of the whitened residuals, (N,) by block."""
+        return [
+            np.square(one.residual / self.deviations(i, noise)).sum(axis=1) for i, one in enumerate(linear)
+        ]
+
+    def normal_equations(
+        self, linear: Sequence[Linearised], weights: Sequence[Array], noise: Mapping[str, float]
+    ) -> Weighted:
+        """Return the normal equations of a step."""
+        count = len(self.scales)
+        hessian, gradient = np.zeros((count, count)), np.zeros(count)
+        parts: dict[str, Array] = {}
+        for i, one in enumerate(linear):
+            roots = np.sqrt(weights[i])[:, None] / self.deviations(i, noise)
+            residual, jacobian = one.residual * roots, one.jacobian * roots[..., None]
+            place = np.ix_(self.columns[i], self.columns[i])
+            for group in self.blocks[i].groups:
+                rows = jacobian[:, group.rows].reshape(-1, jacobian.shape[2])
+                part = rows.T @ rows
+                hessian[place] += part
+                whole = parts.setdefault(group.name, np.zeros((count, count)))
+                whole[place] += part
+                gradient[self.columns[i]] -= rows.T @ residual[:, group.rows].ravel()
+        return Weighted(hessian, gradient, parts)
+
+    # -- weights and sizes of the noise ------------------------------------------------------------------
+
+    def mixture(self, linear: Sequence[Linearised], noise: Mapping[str, float]) -> tuple[list[Array], float]:
+        """Return the inlier probabilities of all observations, and the cost: the negative log likelihood."""
+        weights, cost = [], 0.0
+        for i, square in enumerate(self.squares(linear, noise)):
+            size = linear[i].residual.shape[1]
+            log_scale = size / 2 * math.log(math.tau) + self.log_volumes[i]
+            if self.whiten[i] is None:
+                log_scale = log_scale + float(np.log(self.deviations(i, noise)).sum())
+            if self.outliers is None:
+                weights.append(np.ones(len(square)))
+                cost += float((square / 2 + log_scale).sum())
+                continue
+            inlier = math.log1p(-self.outliers.fraction) - square / 2
+            total = np.logaddexp(inlier, math.log(self.outliers.fraction) + self.log_outlier[i] + log_scale)
+            weights.append(np.exp(inlier - total))
+            cost += float((log_scale - total).sum())
+        return weights, cost
+
+    def median_noise(self, linear: Sequence[Linearised]) -> dict[str, float]:
+        """Return sizes of the noise by the median residual of each group; at least the known ones."""
+        norms: dict[str, list[Array]] = {}
+        for i, one in enumerate(linear):
+            if self.whiten[i] is None:
+                for group in self.blocks[i].groups:
+                    part = one.residual[:, group.rows]
+                    norms.setdefault(group.name, []).append(
+                        np.square(part).sum(axis=1) / _median(part.shape[1])
+                    )
+        result = {}
+        for name, squares in norms.items():
+            size = math.sqrt(float(np.median(np.concatenate(squares))))
+            result[name] = max(size, self.known.get(name, FINEST))
+        return result
+
+    def estimate_noise(
+        self,
+        linear: Sequence[Linearised],
+        weights: Sequence[Array],
+        noise: Mapping[str, float],
+        freedom: dict[str, float],
+    ) -> dict[str, float]:
+        """Return the sizes of the noise at which weighted residuals have the expected squares.
+
+        ``freedom`` are the degrees of freedom that the parameters take from each group.
+        """
+        result, freedom = {**noise}, {name: -freedom[name] for name in self.unknown}
+        squares = dict.fromkeys(self.unknown, 0.0)
+        for i, one in enumerate(linear):
+            if self.whiten[i] is None:
+                for group in self.blocks[i].groups:
+                    if group.name in squares:
+                        part = one.residual[:, group.rows]
+                        squares[group.name] += float(weights[i] @ np.square(part).sum(axis=1))
+                        freedom[group.name] += part.shape[1] * float(weights[i].sum())
+        for name in squares:
+            size = _likely_size(squares[name], max(freedom[name], 0.0), self.medians.get(name))
+            result[name] = max(size, FINEST)
+        return result
+
+    # -- solutions ---------------------------------------------------------------------------------------
+
+    def solve(self, start: Array, present: Array) -> CalibrationFit:
+        """Return the most likely parameters from a start; those that nothing tells are the present ones."""
+        values, linear = self._approach(start)
+        # From above, so that no observation of few is lost at once.
+        noise = {n: max(size, self.medians.get(n, 0.0)) for n, size in self.median_noise(linear).items()}
+        noise |= self.known
+        weights, cost = self.mixture(linear, noise)
+        for _ in range(_STEPS):
+            equations = self.normal_equations(linear, weights, noise)
+            covariance, _ = pseudo_inverse(equations.hessian)
+            step = covariance @ equations.gradient
+            values, linear, _ = self._descend(values, linear, step, noise, cost)
+            freedom = {name: float(np.sum(covariance * part)) for name, part in equations.parts.items()}
+            before, noise = noise, self.estimate_noise(linear, weights, noise, freedom)
+            weights, cost = self.mixture(linear, noise)
+            change = max((abs(noise[n] / before[n] - 1.0) for n in self.unknown), default=0.0)
+            if float(step @ equations.hessian @ step) < _SETTLED and change < _EVEN:
+                break
+        else:
+            raise NoSolutionError(
+                f"The calibration has not converged after {_STEPS} steps: the looks contradict each other. "
+                "Check the names of joints and frames, the units, and that states and observations belong "
+                "together."
+            )
+        values, linear = self._hold_untold(values, linear, weights, noise, present)
+        hessian = self.normal_equations(linear, weights, noise).hessian
+        return CalibrationFit(values, noise, weights, linear, hessian, pseudo_inverse(hessian)[1])
+
+    def refit(self, fit: CalibrationFit, keep: Sequence[Array]) -> Array:
+        """Return the parameters from some of the observations, at the weights and the noise of a fit."""
+        weights = [w * k for w, k in zip(fit.weights, keep, strict=True)]
+        values, linear = fit.values, fit.linear
+        for _ in range(_HALVINGS):
+            equations = self.normal_equations(linear, weights, fit.noise)
+            step, _ = gauss_newton_step(equations)
+            values = values + step
+            linear = self.linearise(values)
+            if float(step @ equations.hessian @ step) < _NEAR:
+                break
+        return values
+
+    def _hold_untold(
+        self,
+        values: Array,
+        linear: list[Linearised],
+        weights: Sequence[Array],
+        noise: Mapping[str, float],
+        present: Array,
+    ) -> tuple[Array, list[Linearised]]:
+        """Return values that explain the data alike, without correction in untold directions."""
+        for _ in range(_HALVINGS):
+            equations = self.normal_equations(linear, weights, noise)
+            step, told = gauss_newton_step(equations)
+            untold = values - present - told @ (told.T @ (values - present))
+            # Where a direction is curved, a step of the others follows.
+            if told.shape[1] == len(values) or np.abs([untold, step]).max() < FINEST:
+                break
+            values = values + step - untold
+            linear = self.linearise(values)
+        return values, linear
+
+    def _approach(self, values: Array) -> tuple[Array, list[Linearised]]:
+        """Go near the solution by Cauchy weights at the scale of the median."""
+        linear = self.linearise(values)
+        for _ in range(_ROUGH):
+            noise = self.median_noise(linear)
+            weights = []
+            for i, square in enumerate(self.squares(linear, noise)):
+                size = linear[i].residual.shape[1]
+                if self.whiten[i] is not None:
+                    square = square / max(float(np.median(square)) / _median(size), 1.0)
+                weights.append((1 + size) / (1 + square) if self.outliers else np.ones(len(square)))
+            equations = self.normal_equations(linear, weights, noise)
+            step, _ = gauss_newton_step(equations)
+            cost = self._rough_cost(linear, noise)
+            values, linear, length = self._descend(values, linear, step, noise, cost, rough=True)
+            if float(step @ equations.hessian @ step) * length**2 < _NEAR:
+                break
+        return values, linear
+
+    def _rough_cost(self, linear: Sequence[Linearised], noise: Mapping[str, float]) -> float:
+        total = 0.0
+        for i, square in enumerate(self.squares(linear, noise)):
+            size = linear[i].residual.shape[1]
+            total += float((np.log1p(square) * (1 + size) if self.outliers else square).sum()) / 2
+        return total
+
+    def _descend(
+        self,
+        values: Array,
+        linear: list[Linearised],
+        step: Array,
+        noise: Mapping[str, float],
+        cost: float,
+        rough: bool = False,
+    ) -> tuple[Array, list[Linearised], float]:
+        """Take a step, at most of the prior size, and halve it until the cost is lower."""
+        length = min(1.0, 1.0 / max(float(np.abs(step).max(initial=0.0)), 1e-300))
+        for _ in range(_HALVINGS):
+            there = self.linearise(values + length * step)
+            finite = all(np.isfinite(one.residual).all() for one in there)
+            reached = self._rough_cost(there, noise) if rough else self.mixture(there, noise)[1]
+            if finite and reached <= cost + 1e-9 * abs(cost) + 1e-9:
+                return values + length * step, there, length
+            length /= 2
+        return values, linear, 0.0
+
+
+def gauss_newton_step(equations: Weighted) -> tuple[Array, Array]:
+    """Return the step in the directions that the data tell, and these directions (p, r)."""
+    values, axes = told_directions(equations.hessian)
+    return axes @ (axes.T @ equations.gradient / values), axes
+
+
+def pseudo_inverse(hessian: Array) -> tuple[Array, int]:
+    """Return the inverse of H in the directions that the data tell, and their number."""
+    values, axes = told_directions(hessian)
+    return (axes / values) @ axes.T, len(values)
+
+
+def told_directions(hessian: Array) -> tuple[Array, Array]:
+    """Return eigenvalues (r,) and eigenvectors (p, r) of H in directions told better than the prior size."""
+    values, axes = np.linalg.eigh(hessian)
+    told = values > max(1.0, _ROUNDING * len(values) * float(values[-1]))
+    return values[told], axes[:, told]
+
+
+def _likely_size(square: float, freedom: float, median: float | None) -> float:
+    """Return the most likely size of noise for a sum of squares with some degrees of freedom.
+
+    Its prior is log-normal around the median. Without it, the size of a group that the parameters can fit
+    exactly, as with few looks, would be zero.
+    """
+    if median is None:
+        return math.sqrt(square / max(freedom, 1.0))
+    variance, log = NOISE_SPREAD**2, math.log(median)
+    for _ in range(_STEPS):
+        # Maximum of -ν log σ - S/(2σ²) - (log σ - log median)²/(2 s²) over log σ, which is concave.
+        pull = square * math.exp(-2.0 * log)
+        step = (pull - freedom - (log - math.log(median)) / variance) / (2.0 * pull + 1.0 / variance)
+        log += max(-1.0, min(step, 1.0))
+        if abs(step) < _EVEN:
+            break
+    return math.exp(log)
+
+
+def _median(size: int) -> float:
+    """Return the median of χ² with some degrees of freedom (Wilson and Hilferty)."""
+    return size * (1 - 2 / (9 * size)) ** 3
+
+
+def check_residuals(linear: Sequence[Linearised], blocks: Sequence[ResidualBlock]) -> None:
+    """Refuse residuals that are not finite at the present model."""
+    for one, block in zip(linear, blocks, strict=True):
+        wrong = np.flatnonzero(~np.isfinite(one.residual).all(axis=1))
+        if len(wrong):
+            raise InvalidValueError(
+                f"'{block.label}' has no finite prediction in look {block.looks[wrong[0]]} by the present "
+                "model. A point on the image plane of a camera has no pixel."
+            )
