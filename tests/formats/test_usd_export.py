@@ -95,7 +95,7 @@ def test_poses_of_the_stage_are_those_of_the_model(name: str, tmp_path: Path) ->
     check = check_conversion(model, file, states=10)
     assert check.ok, check.wrong
     assert check.frames == len(model.frames)
-    assert check.engine == "pxr"
+    assert check.engine == "usd-core"
     assert check.version
 
 
