@@ -10,7 +10,7 @@ from kineverse_studies.bench import BENCHMARKS
 
 from . import short_forms
 from .rules import EXTREME, TIME, ByRow, Count, CountOf, Key, Largest, Mean, Rule, Same, Share, Unchecked
-from .short_forms import FIG4_CONFIGURATIONS, LOCKBOXES, STREAMS, TYPE_CASES, Tables
+from .short_forms import CHECK_SEED, FIG4_CONFIGURATIONS, LOCKBOXES, STREAMS, TYPE_CASES, Tables
 
 
 @dataclass(frozen=True)
@@ -416,6 +416,17 @@ LOCKBOX = (
     ),
 )
 
+CHECKS = (
+    DocumentedTable(
+        "checks",
+        "checks.md",
+        f"kineverse reproduce checks --seed {CHECK_SEED}",
+        "Broken models",
+        {"break": KEY, "kind of break": KEY, "found": CountOf(), "named rightly": CountOf()},
+        short_forms.checks,
+    ),
+)
+
 # Benchmarks that take minutes.
 _QUICKER = ("document", "geometry", "inverse_kinematics", "control")
 # They need robots and problems of other people, and minutes: they are on no page.
@@ -458,5 +469,5 @@ DEPLOYMENT = (
     ),
 )
 
-DOCUMENTED = (*FIG4, *STURM, *STREAM, *JOINTS, *MANIPULATION, *LOCKBOX, *BENCH, *DEPLOYMENT)
+DOCUMENTED = (*FIG4, *STURM, *STREAM, *JOINTS, *MANIPULATION, *LOCKBOX, *CHECKS, *BENCH, *DEPLOYMENT)
 """All tables, in the order of the pages."""
