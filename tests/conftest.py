@@ -34,7 +34,7 @@ import published_data
 from native_libraries import compile_native_libraries
 
 ROOT = Path(__file__).parents[1]
-sys.path.append(str(ROOT / "examples"))  # living_kitchen
+sys.path += [str(ROOT / "examples"), str(ROOT / "tools")]  # living_kitchen; what tools and tests share
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 ROS_PYTHON = Path(sys.prefix, "ros", "bin", "python")  # of wheels, with the packages of this environment
 

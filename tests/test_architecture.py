@@ -5,7 +5,6 @@ from __future__ import annotations
 import ast
 import re
 import runpy
-import sys
 import tomllib
 from collections import Counter
 from functools import cache
@@ -16,7 +15,6 @@ import pytest
 import kineverse as kv
 
 ROOT = Path(__file__).parents[1]
-sys.path.insert(0, str(ROOT / "tools"))
 
 from inventory.size import count_lines, find_importers, find_modules  # noqa: E402  - it is no part of the package
 

@@ -5,14 +5,12 @@ are compared in ``tests/bench``.
 """
 
 import re
-import sys
 from collections import Counter
 from pathlib import Path
 
 import pytest
 
 ROOT = Path(__file__).parents[1]
-sys.path.insert(0, str(ROOT / "tools"))
 
 from figures.documented import DOCUMENTED  # noqa: E402  - it is no part of the package
 from figures.pages import DOCS, Table, find_blocks, find_tables, pages, without_blocks, write_block  # noqa: E402

@@ -54,13 +54,15 @@ notch at 0.8 m: height 0.755 m, level: True
     "12_collision_distances": "kitchen/fridge_area and kitchen/fridge_door: ...\nkitchen/fridge_door:velocity ... m/rad",
     "13_identify_a_joint": "revolute with probability ...\naxis [0. 0. 1.] through [0.3 0. ]\nrevolute (door,)",
     "14_track_a_state": "...kitchen/fridge_door: 0.90 ± ...\nkitchen/oven_left_drawer: 0.20 ± ...",
-    "15_convert_formats": "...True\ndiffers in ('bodies/handle',)\nchanged: (...'frames/handle')",
+    "15_convert_formats": "...True\ndiffers in ('bodies/handle',)\n...\nchanged: (...'frames/handle')",
     "16_mobile_base": "...{'base/angle': 0.8, 'base/x': 0.897, 'base/y': 0.379}",
     "17_operation_of_your_own": "[0.4 0. 0. ] [0.5 0. 0. ]\n['handle'] ['handle']",
     "18_reach": "pr2/r_gripper_tool_frame reaches 1.19 m far, ...",
     "19_open_a_door": "pr2 moves 12 joints, ...\nopen by 1.39 rad, ..., none violated",
     "20_plan_a_motion": "8 joints, ... points, ... s\nnothing is nearer than ... mm",
+    "23_learn_a_hinge": "... mm between ...\nx = 301 mm, in truth 300 mm\ny = -201 mm, ...\nroll = 1.5°, in truth 1.5°\npitch = -2.0°, ...",
     "21_live_system": "...joint door is revolute\n...the door is open by 1.2 rad...",
+    "22_calibrate": "Calibration of 13 parameters from 30 looks\n...in looks 7\n...7 lines of the URDF are new",
 }
 
 NEEDED = {
@@ -69,6 +71,7 @@ NEEDED = {
     "19_open_a_door": ("daqp",),
     "20_plan_a_motion": ("coal",),
     "21_live_system": ("zenoh", "daqp", "coal"),
+    "23_learn_a_hinge": ("jax",),
 }
 """The modules that examples need beyond the core."""
 

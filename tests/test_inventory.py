@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import copy
 import json
-import sys
 from pathlib import Path
 
 import pytest
 
 ROOT = Path(__file__).parents[1]
-sys.path.insert(0, str(ROOT / "tools"))
 
 from inventory import commands, models, names  # noqa: E402  - it is no part of the package
 from inventory.compare import compare  # noqa: E402

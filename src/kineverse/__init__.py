@@ -44,6 +44,7 @@ if TYPE_CHECKING:
         Revolute as Revolute,
     )
     from kineverse.compilation import CompiledFunction as CompiledFunction, compile as compile
+    from kineverse.compilation.backends import to_jax as to_jax, to_torch as to_torch
     from kineverse.errors import (
         ConflictError as ConflictError,
         KineverseError as KineverseError,

@@ -2,6 +2,8 @@
 
 import json
 import os
+import re
+import sys
 from functools import partial
 
 import pytest
@@ -52,7 +54,9 @@ def test_convert_lists_unsupported_constraints(run, robot):
     pytest.importorskip("mujoco")
     status, out, err = run("robot.urdf", "robot.xml")
     assert (status, err) == (0, "")
-    assert "remarks on writing\n    MuJoCo knows no limits of speeds" in out
+    remarks = out.partition("remarks on writing\n")[2]
+    assert "elements of URDF that say nothing of motion are not written: 1 <my_joint>\n" in remarks
+    assert "MuJoCo knows no limits of speeds" in remarks
     assert main(["diff", "--values", "robot.urdf", "robot.xml"]) == 0
 
 
@@ -105,7 +109,8 @@ def test_leave_out_removes_the_named_constraints_only(run, tmp_path, monkeypatch
         "default.urdf leaves out 1 thing that it cannot express; --strict refuses instead:",
         "  lock has bounds that depend on bolt",
     ]
-    assert kv.load("default.urdf").snapshot() == kv.load("door.urdf").snapshot()
+    default, door = ((tmp_path / f"{name}.urdf").read_text() for name in ("default", "door"))
+    assert default.partition("<link")[2] == door.partition("<link")[2]
     status, out, err = run("door.kv.json", "json.urdf", "--json")
     assert json.loads(out)["left_out"] == {"lock": "has bounds that depend on bolt"}
     status, _, err = run("door.kv.json", "again.urdf", "--leave-out", "lokc")
@@ -193,7 +198,7 @@ def test_names_in_any_script_are_kept(run, robot, tmp_path):
         ("out.txt", ".urdf, .xml"),
         ("out", ".urdf, .xml"),
         ("", "file to write is empty"),
-        ("out.sdf", ".urdf, .xml"),
+        ("out.obj", ".urdf, .xml"),
         ("nowhere/out.kv.json", "the folder nowhere does not exist"),
         ("robot.urdf/out.kv.json", "the folder robot.urdf does not exist"),
         ("folder", "folder/robot.kv.json"),
@@ -233,3 +238,73 @@ def test_convert_to_a_read_only_folder_is_an_error(run, robot, tmp_path, monkeyp
     assert (status, out, len(err.splitlines())) == (2, "", 1)
     assert "Permission denied" in err
     assert os.listdir(tmp_path) == ["robot.urdf"]
+
+
+def test_a_check_by_the_engine_is_printed_and_in_the_json(run, robot):
+    pytest.importorskip("pydrake")
+    status, out, err = run("robot.urdf", "robot.sdf", "--check")
+    assert (status, err) == (0, "")
+    assert re.search(
+        r"^  checked by drake [\d.]+: 100 states, 2 frames, largest difference .* rad", out, re.M
+    )
+    status, out, _ = run("robot.urdf", "robot.sdf", "--check", "--json", "--force")
+    check = json.loads(out)["check"]
+    assert {key: check[key] for key in ("engine", "states", "frames", "ok")} == {
+        "engine": "drake",
+        "states": 100,
+        "frames": 2,
+        "ok": True,
+    }
+    assert set(check["largest"]) >= {"distance", "angle", "frame"}
+    assert "check" not in json.loads(run("robot.urdf", "robot.sdf", "--json", "--force")[1])
+
+
+def test_a_file_that_moves_otherwise_gives_status_1_and_is_kept(run, robot, monkeypatch):
+    pytest.importorskip("pydrake")
+    write = kv.Model.save
+
+    def wrong(model, path, **options):
+        saved = write(model, path, **options)
+        text = saved.path.read_text()
+        saved.path.write_text(text.replace("<xyz>1 0 0</xyz>", "<xyz>0 1 0</xyz>"))
+        return saved
+
+    monkeypatch.setattr(kv.Model, "save", wrong)
+    status, out, err = run("robot.urdf", "robot.sdf", "--check")
+    assert status == 1
+    assert "The first joint that differs is 'j'. robot.sdf is kept, for a look at it only." in err
+    assert os.path.exists("robot.sdf")
+    status, out, _ = run("robot.urdf", "robot.sdf", "--check", "--force", "--json")
+    assert status == 1
+    check = json.loads(out)["check"]
+    assert (check["ok"], check["cause"], check["wrong"]) == (False, "j", ["b"])
+
+
+def test_a_tolerance_shows_its_bound_beside_the_difference(run, robot):
+    pytest.importorskip("mujoco")
+    status, out, _ = run("articulations/pedal_bin", "bin.xml", "--check", "--tolerance", "0.01")
+    assert status == 0
+    assert re.search(r"largest difference .*\n    bound of the approximated frames 0 m and 0\.00\d+ rad", out)
+
+
+@pytest.mark.parametrize(
+    ("target", "message"),
+    [
+        ("robot.kv.json", "robot.kv.json cannot be checked: no other engine reads it"),
+        ("-", "--check and - exclude each other"),
+    ],
+)
+def test_a_check_of_a_document_is_refused_before_anything_is_written(run, robot, target, message):
+    status, out, err = run("robot.urdf", target, "--check")
+    assert (status, out) == (2, "")
+    assert message in err
+    assert not os.path.exists("robot.kv.json")
+
+
+def test_a_missing_engine_is_told_before_anything_is_written(run, robot, monkeypatch):
+    monkeypatch.setitem(sys.modules, "pydrake", None)
+    monkeypatch.setitem(sys.modules, "pydrake.multibody.plant", None)
+    status, _, err = run("robot.urdf", "robot.sdf", "--check")
+    assert status == 2
+    assert "drake, which reads such a file, is not installed: " in err
+    assert not os.path.exists("robot.sdf")

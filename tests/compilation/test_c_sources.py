@@ -56,12 +56,12 @@ def texts_of(source: str) -> Iterator[tuple[str, int, str]]:
 
 
 def test_each_file_is_part_of_a_library_or_of_a_generated_source() -> None:
-    assert {name for name in FILES if name.endswith(".c")} == {*LIBRARIES, "batch.c"}
-    sources = [read_source(name) for name in LIBRARIES] + [read_source("batch.c", {"program.h": "int n;"})]
+    assert {name for name in FILES if name.endswith(".c")} == {*LIBRARIES, "batch.c", "xla_ffi.c"}
+    sources = [read_source(name) for name in LIBRARIES] + [read_source("xla_ffi.c", {"program.h": "int n;"})]
     assert {name for source in sources for name, _, _ in texts_of(source)} == {*FILES, "program.h"}
 
 
-@pytest.mark.parametrize("name", ["geometry.c", "planning.c", "batch.c"])
+@pytest.mark.parametrize("name", ["geometry.c", "planning.c", "xla_ffi.c"])
 def test_compilers_are_told_the_file_and_line_of_each_line(name: str) -> None:
     generated = {"program.h": "int n;\nint m;"}
     found = list(texts_of(read_source(name, generated)))
@@ -82,7 +82,7 @@ def test_hand_written_c_has_no_warnings(compiler: str, how: str, name: str) -> N
 
 @pytest.mark.compiler
 @pytest.mark.parametrize("compiler", ["gcc", "clang"])
-@pytest.mark.parametrize("kind", ["single", "batch", "float", "double"])
+@pytest.mark.parametrize("kind", ["single", "batch", "xla", "float", "double"])
 def test_generated_c_has_no_warnings(compiler: str, kind: str) -> None:
     x, y = kv.position("x"), kv.position("y")
     pose = kv.rotation_z(x) @ kv.translation(y, 0, x)
@@ -93,6 +93,10 @@ def test_generated_c_has_no_warnings(compiler: str, kind: str) -> None:
         flags.append("-Wno-unused-parameter")
     elif kind == "batch":
         source = generate_batch_source(Program(outputs, [x, y]))
+    elif kind == "xla":
+        ffi = pytest.importorskip("jax.ffi")
+        source = generate_batch_source(Program(outputs, [x, y]), "xla_ffi.c")
+        flags.append(f"-isystem{ffi.include_dir()}")
     else:
         source = VectorProgram(outputs, [x], [y], scalar="float" if kind == "float" else "double")._source()
     compile_strictly(compiler, source, *flags)

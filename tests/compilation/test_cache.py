@@ -100,7 +100,7 @@ def test_a_damaged_library_is_compiled_again(
 @pytest.mark.compiler
 def test_a_library_that_cannot_be_loaded_is_compiled_again(folder: Path, elsewhere: Path) -> None:
     shutil.copytree(elsewhere, folder)
-    path = next(p for p in libraries(folder) if p.stem == kv.compile(outputs(), tier="c")._library._key)
+    path = next(p for p in libraries(folder) if p.stem == kv.compile(outputs(), tier="c")._library.key)
     content = b"whole, but no library"
     path.unlink()
     path.write_bytes(content + cache._MARK + hashlib.sha256(content).digest())

@@ -240,7 +240,7 @@ def test_a_library_is_unloaded_with_the_last_that_needs_it() -> None:
         return Path("/proc/self/maps").read_text().count(f"/{key}.so")
 
     f = kv.compile([a * b + 7.125, np.sin(b)], tier="c", wait=True)
-    key = f._library._key
+    key = f._library.key
     assert loaded() > 0
     evaluator = f.bind()
     del f

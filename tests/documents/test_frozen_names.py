@@ -16,7 +16,6 @@ import hashlib
 import importlib
 import inspect
 import json
-import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,6 +23,7 @@ from typing import Any
 
 import pytest
 from document_models import Doubled, rich_model
+from scenes import SCENES, build_scene, scene_document
 
 import kineverse as kv
 from kineverse import gallery
@@ -35,10 +35,6 @@ from kineverse.formats.document.parameters import CLASSES, document_kind, find_c
 from kineverse.formats.locate import shipped_models
 from kineverse.model.body import Box, Capsule, Cone, Cylinder, Ellipsoid, Mesh, Sphere
 from kineverse.model.operation import Operation
-
-sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
-
-from scenes import SCENES, build_scene, scene_document
 
 FOLDER = Path(__file__).parent
 DIGESTS: dict[str, dict[str, str]] = json.loads((FOLDER / "digests.json").read_text("utf-8"))

@@ -3,23 +3,18 @@
 from __future__ import annotations
 
 import inspect
-import sys
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from scenes import SCENES, build_scene
 
 import kineverse as kv
 from kineverse.formats.document import read_operations, to_json
 from kineverse.model.basic_operations import SetBody, SetRate
 from kineverse.model.body import Box, Cylinder, Mesh, Sphere
-
-sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
-
-from scenes import SCENES, build_scene
 
 KINDS: dict[str, type[kv.Operation]] = {
     name: kind

@@ -2,20 +2,15 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scenes import build_scene  # noqa: F401  - it is no part of the package
 
 import kineverse as kv
 from kineverse.formats.document import to_json
-
-sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
-
-from scenes import build_scene  # noqa: F401  - it is no part of the package
 
 LIFT, KNOB, WHEEL = kv.position("lift"), kv.position("knob"), kv.velocity("wheel")
 

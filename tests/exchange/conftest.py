@@ -12,8 +12,6 @@ import pytest
 
 import kineverse as kv
 
-sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))  # for what they share with the search for faults
-
 Start = Callable[..., "subprocess.Popen[str]"]
 
 

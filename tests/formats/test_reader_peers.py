@@ -1,8 +1,6 @@
 """Files that pinocchio and MuJoCo read are read: a short run of ``tools/fuzz/peers.py``."""
 
-import sys
 from itertools import islice
-from pathlib import Path
 from random import Random
 
 import pytest
@@ -10,7 +8,6 @@ import pytest
 pytest.importorskip("pinocchio")
 pytest.importorskip("mujoco")
 
-sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
 
 from fuzz.inputs import inputs
 from fuzz.peers import find_peer, quiet, unexcused_error

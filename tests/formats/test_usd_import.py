@@ -222,7 +222,7 @@ def test_a_copy_in_another_form_and_a_light_beside_change_nothing(written: Path,
     def add_light(stage: Usd.Stage) -> None:
         UsdLux.DistantLight.Define(stage, "/light")
 
-    for ending in (".usdc", ".usd", ".usda"):
+    for ending in (".usdc", ".usda"):
         copy = edit_stage(written, add_light, tmp_path / f"copy{ending}")
         again, remarks = load(copy)
         assert document_hash(again) == before
@@ -292,6 +292,59 @@ def test_the_scale_of_a_body_scales_the_places_of_its_joints(tmp_path: Path) -> 
     joint.CreateLocalPos1Attr((0.25, 0.0, 0.0))
     model, _ = load(arm.save(tmp_path / "arm.usda"))
     assert np.allclose(model.fk("big", "far")({}), kv.translation(-0.5, 0, 0)({}), atol=CLOSE)
+
+
+def test_values_of_a_wrong_type_are_refused_or_left_out(tmp_path: Path) -> None:
+    arm = Arm()
+    UsdGeom.Sphere.Define(arm.stage, "/arm/far/ball").CreateRadiusAttr(0.5)
+    text = arm.stage.GetRootLayer().ExportToString()
+    file = tmp_path / "arm.usda"
+    file.write_text(text.replace("double radius = 0.5", 'string radius = "big"'))
+    model, remarks = load(file)
+    assert "far" not in model.bodies
+    assert "/arm/far/ball has a size that is none" in remarks[0]
+    file.write_text(
+        text.replace("matrix4d xformOp:transform = (", "double3 xformOp:transform = (0, 0, 0) #", 1)
+    )
+    with pytest.raises(FormatError, match="no USD that can be read"):
+        kv.load(file)
+
+
+def test_a_mirrored_cone_points_the_other_way(tmp_path: Path) -> None:
+    arm = Arm()
+    cone = UsdGeom.Cone.Define(arm.stage, "/arm/far/cone")
+    cone.AddScaleOp().Set((1.0, 1.0, -1.0))
+    model, _ = load(arm.save(tmp_path / "arm.usda"))
+    (shape,) = model.bodies["far"].visuals
+    assert np.allclose(shape.origin.matrix[:3, 2], (0.0, 0.0, -1.0))
+
+
+def test_joints_may_lead_inwards(tmp_path: Path) -> None:
+    arm, there = Arm(), {"hinge": 0.3, "slide": 0.25}
+    straight, _ = load(arm.save(tmp_path / "straight.usda"))
+    for joint in (arm.hinge, arm.slide):
+        prim = joint.GetPrim()
+        ends = [prim.GetRelationship(f"physics:body{k}").GetTargets() for k in (0, 1)]
+        places = [prim.GetAttribute(f"physics:localPos{k}").Get() for k in (0, 1)]
+        for k in (0, 1):
+            prim.GetRelationship(f"physics:body{k}").SetTargets(ends[1 - k])
+            prim.GetAttribute(f"physics:localPos{k}").Set(places[1 - k])
+    turned, remarks = load(arm.save(tmp_path / "turned.usda"))
+    assert len(remarks) == 2
+    back = {name: -value for name, value in there.items()}  # the other body moves the other way
+    expected = straight.fk("far")(there)
+    assert np.allclose(turned.fk("far")(back), expected, atol=CLOSE)
+    assert np.allclose(stage_poses(tmp_path / "turned.usda", back)["far"], expected, atol=CLOSE)
+
+
+def test_shapes_of_instances_are_read(tmp_path: Path) -> None:
+    arm = Arm()
+    UsdGeom.Cube.Define(arm.stage, "/shapes/cube")
+    look = UsdGeom.Xform.Define(arm.stage, "/arm/far/look").GetPrim()
+    look.GetReferences().AddInternalReference("/shapes")
+    look.SetInstanceable(True)
+    model, _ = load(arm.save(tmp_path / "arm.usda"))
+    assert [shape.geometry for shape in model.bodies["far"].visuals] == [Box((2.0, 2.0, 2.0))]
 
 
 def test_a_base_without_a_joint_moves_freely(tmp_path: Path) -> None:
@@ -371,8 +424,8 @@ def test_what_is_not_read_is_said(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "content", "reason"),
     [
-        ("text.usda", b"hello", "no USD that can be read"),
-        ("broken.usda", b'#usda 1.0\ndef Xform "a" {\n oops', "Expected }"),
+        ("text.usda", b"hello", "can be read: it is not a valid usda layer."),
+        ("broken.usda", b'#usda 1.0\ndef Xform "a" {\n oops', "can be read: line 3:2: Expected }"),
         ("empty.usd", b"", "no USD that can be read"),
         ("bad.usdc", b"PXR-USDC" + b"\0" * 60, "no USD that can be read"),
         ("cut.usdc", b"PXR-USDC\0\0", "no USD that can be read"),

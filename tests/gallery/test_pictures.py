@@ -4,16 +4,12 @@ from __future__ import annotations
 
 import re
 import struct
-import sys
 from pathlib import Path
 
 import pytest
+from scenes import mechanisms
 
 from kineverse import gallery
-
-sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
-
-from scenes import mechanisms
 
 DOCS = Path(__file__).parents[2] / "docs"
 PICTURES = DOCS / "pictures"

@@ -23,6 +23,6 @@ def test_what_is_killed_or_frozen_stops_the_robot_which_finishes_later():
     setting = faults.Setting(
         model, "shelf_drawers/upper_drawer", "shelf_drawers/upper_drawer_handle", world="kinematic"
     )
-    found = faults.try_faults(setting, faults.FAULTS[:3], BUSY)
-    assert len(found) == 3
+    found = faults.try_faults(setting, faults.FAULTS[:2], BUSY)
+    assert len(found) == 2
     assert found[0]["way"] < 0.1

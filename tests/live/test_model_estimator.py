@@ -88,6 +88,7 @@ def test_a_part_that_is_hidden_in_mid_motion_is_learned_nevertheless():
     assert error(watch.model, truth, 1.0)[0] < 0.03
 
 
+@pytest.mark.long
 def test_what_is_carried_along_has_no_joint():
     watch = Watch(make_truth(), make_served("joint"))
     watch.look(2.0)
@@ -146,6 +147,7 @@ def test_a_known_joint_that_is_implausible_is_replaced_after_a_while():
     assert HINGE not in watch.note.alarms
 
 
+@pytest.mark.long
 def test_a_cautious_estimator_waits_until_what_it_proposes_is_accepted():
     watch = Watch(make_truth(), make_truth(), settling=1.0, asks=True)
     watch.look(2.0)
@@ -173,6 +175,7 @@ def test_a_door_that_was_taken_for_a_drawer_becomes_one_that_is_shut_at_zero():
         assert error(watch.model, truth, value)[0] < 0.02
 
 
+@pytest.mark.long
 def test_if_most_furniture_stands_elsewhere_the_robot_is_lost_and_nothing_is_moved():
     watch = Watch(make_truth(), make_truth())
     watch.look(2.0)

@@ -3,18 +3,13 @@
 from __future__ import annotations
 
 import math
-import sys
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scenes import build_scene
 
 import kineverse as kv
-
-sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
-
-from scenes import build_scene
 
 Z, Y, X = (0, 0, 1), (0, 1, 0), (1, 0, 0)
 

@@ -264,6 +264,7 @@ def test_what_is_pushed_out_of_sight_and_gets_stuck_is_not_done():
     assert "no marker of it has been seen" in outcome.reason
 
 
+@pytest.mark.long
 def test_what_is_out_of_sight_for_a_while_is_done_once_it_is_seen_again():
     robot = make("hidden", lasting=4.5)
     outcome = open_object(follow(robot), DRAWER, target=0.3)
@@ -271,6 +272,7 @@ def test_what_is_out_of_sight_for_a_while_is_done_once_it_is_seen_again():
     assert robot.world.state[DRAWER] == pytest.approx(0.3, abs=0.01)
 
 
+@pytest.mark.long
 def test_an_object_is_pulled_no_faster_after_pauses_within_the_time_out():
     """The robot stops by itself, its clock runs on, and a command would act for 2 s."""
     speeds = []

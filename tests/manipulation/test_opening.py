@@ -175,6 +175,7 @@ def test_drawer_opens_by_friction_on_estimates(model):
     assert metrics.measures["estimate_mean"] < 0.003
 
 
+@pytest.mark.long
 def test_loss_of_a_drawer_that_moves_too_hard_is_noticed_and_said(model):
     pytest.importorskip("mujoco")
     world = MujocoWorld(model, "hsr", door_friction={DRAWER: 150.0})  # and friction holds 100 N
@@ -401,6 +402,7 @@ def test_hand_believes_that_a_locked_door_is_open_where_it_is():
     assert HandMotion(run, opener, handle).state[door] == 0.5
 
 
+@pytest.mark.long
 def test_drawer_that_is_locked_on_the_way_is_said_not_to_move():
     model = pusher()
     with model.edit() as edit:

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+import random_cupboards
 
 import kineverse as kv
 from cupboards import box
@@ -17,9 +17,6 @@ from kineverse.model.model import Model
 from kineverse.state import State
 from kineverse.worlds import KinematicWorld, TrueBelief
 from robot_interface_proxy import InterfaceOnly
-
-sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
-import random_cupboards
 
 
 def cupboard(*, limits: bool = True, **solids: tuple[tuple[float, ...], tuple[float, ...]]) -> Model:

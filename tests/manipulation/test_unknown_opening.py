@@ -188,6 +188,7 @@ def test_door_that_was_believed_to_slide_is_relearned_and_opened(truth):
     assert model.articulations[DOOR].kind == "revolute"
 
 
+@pytest.mark.long
 def test_door_that_nothing_moves_is_said_not_to_follow(truth):
     model, locked = forget_joint(truth, DOOR, truth.default_state()), truth.copy()
     with locked.edit() as edit:

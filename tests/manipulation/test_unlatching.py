@@ -156,6 +156,7 @@ def test_room_door_opens_by_its_lever_and_is_let_go_at_rest():
     assert values["release"][0][LEVER] < 0.05  # turned back before it is let go
 
 
+@pytest.mark.long
 def test_microwave_opens_by_its_button_on_estimates():
     model = microwave()
     outcome, values = move(model, "hsr", OVEN, world="kinematic", noise=True, target=0.5)

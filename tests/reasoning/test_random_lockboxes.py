@@ -1,15 +1,11 @@
 """Plans for random lockboxes agree with exhaustive search: a short run of ``tools/lockboxes.py``."""
 
-import sys
 from collections import Counter
-from pathlib import Path
 
 import pytest
+from lockboxes import draw_box, try_box
 
 from kineverse.reasoning.move_search import MoveSearch
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tools"))
-from lockboxes import draw_box, try_box
 
 REFUTED = (30012, 30015, 30021, 30031, 30054, 30056, 30076)
 """Boxes of which several combinations of intervals are within reach, and the goal is not."""

@@ -160,6 +160,7 @@ def test_hidden_markers_become_uncertain_and_a_new_sensor_model_is_used():
     assert uncertainty_color(0.8) != uncertainty_color(0.05)
 
 
+@pytest.mark.long
 def test_uncertainty_paths_pass_the_tracked_positions_and_have_their_lengths(chest):
     kitchen_tracker = chest[0].kitchen_tracker
     ways = kitchen_tracker.uncertainty_paths()
@@ -173,10 +174,10 @@ def test_uncertainty_paths_pass_the_tracked_positions_and_have_their_lengths(che
 
 @pytest.mark.parametrize(
     "name",
-    ["chest", "crate", pytest.param("stool", marks=pytest.mark.long)],  # docs/demo.md has the stool
+    ["crate", *(pytest.param(name, marks=pytest.mark.long) for name in ("chest", "stool"))],
 )
-def test_an_unknown_mechanism_is_identified_and_then_tracked(name, chest):
-    simulation, off = chest[::2] if name == "chest" else simulate_mechanism(10.0, mechanism=name)
+def test_an_unknown_mechanism_is_identified_and_then_tracked(name):
+    simulation, off = simulate_mechanism(10.0, mechanism=name)
     mechanism, learner = simulation.mechanism, simulation.learner
     assert max(learner.history[0].probabilities.values()) < 0.95  # ambiguous at first
     assert not learner.result.is_ambiguous
@@ -264,6 +265,7 @@ def test_axis_covariances_are_those_of_sampled_axes(chest):
 # -- drawing ---------------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_rods_are_round_and_axis_tubes_are_two_deviations_wide(chest):
     points = np.array([[0.0, 0.0, 0.0], [0.1, 0.2, 0.2], [0.2, 0.4, 0.4]])
     away = create_rod(points, 0.05).vertices - np.repeat(points, 16, axis=0)
@@ -280,6 +282,7 @@ def test_rods_are_round_and_axis_tubes_are_two_deviations_wide(chest):
     np.testing.assert_allclose(np.sqrt(squares), SIGMAS, rtol=0.02)
 
 
+@pytest.mark.long
 def test_a_picture_shows_both_worlds_and_the_identified_axis(chest):
     young, simulation = Simulation(), chest[0]
     before, after = (picture(one, (500, 260)).astype(int) for one in (young, simulation))
@@ -306,6 +309,7 @@ def test_the_part_of_an_unidentified_mechanism_is_not_drawn_in_the_estimate():
     assert key not in drawables.poses()
 
 
+@pytest.mark.long
 def test_reports_contain_errors_and_probabilities(chest):
     simulation = chest[0]
     assert f"{1e3 * simulation.average_quality.marker:.0f} mm" in format_kitchen(simulation)
@@ -316,6 +320,7 @@ def test_reports_contain_errors_and_probabilities(chest):
     assert "looking" in format_mechanism(Simulation())
 
 
+@pytest.mark.long
 def test_tables_contain_errors_and_the_identified_axis(chest):
     simulation, quality = chest[0], average(chest[1][36:])
     tracked = dict(tabulate_tracking(simulation, quality)[1])

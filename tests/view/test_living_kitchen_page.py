@@ -76,6 +76,7 @@ def shot(tab):
     return browsers.shot(tab, 250, 300)
 
 
+@pytest.mark.long
 @pytest.mark.browser
 def test_the_browser_shows_the_simulation_and_the_identified_joint(browser, monkeypatch):
     # The mechanism stays, however slowly the page is drawn.

@@ -73,7 +73,7 @@ FAULTS = (
     Fault("track", "KILL", "retract"),
     Fault("serve", "KILL", HOLDING),
 )
-"""The runs; the first three are the short form."""
+"""The runs; the first two are the short form."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

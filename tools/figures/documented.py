@@ -10,7 +10,17 @@ from kineverse_studies.bench import BENCHMARKS
 
 from . import short_forms
 from .rules import EXTREME, TIME, ByRow, Count, CountOf, Key, Largest, Mean, Rule, Same, Share, Unchecked
-from .short_forms import FIG4_CONFIGURATIONS, LOCKBOXES, STREAMS, TYPE_CASES, Tables
+from .short_forms import (
+    CALIBRATED_DRAWS,
+    CALIBRATED_DRIVES,
+    CHECK_SEED,
+    FIG4_CONFIGURATIONS,
+    HAND_EYES,
+    LOCKBOXES,
+    STREAMS,
+    TYPE_CASES,
+    Tables,
+)
 
 
 @dataclass(frozen=True)
@@ -416,6 +426,17 @@ LOCKBOX = (
     ),
 )
 
+CHECKS = (
+    DocumentedTable(
+        "checks",
+        "checks.md",
+        f"kineverse reproduce checks --seed {CHECK_SEED}",
+        "Broken models",
+        {"break": KEY, "kind of break": KEY, "found": CountOf(), "named rightly": CountOf()},
+        short_forms.checks,
+    ),
+)
+
 # Benchmarks that take minutes.
 _QUICKER = ("document", "geometry", "inverse_kinematics", "control")
 # They need robots and problems of other people, and minutes: they are on no page.
@@ -458,5 +479,79 @@ DEPLOYMENT = (
     ),
 )
 
-DOCUMENTED = (*FIG4, *STURM, *STREAM, *JOINTS, *MANIPULATION, *LOCKBOX, *BENCH, *DEPLOYMENT)
+_CONVERSION = "kineverse reproduce conversion"
+_ROBOTS = Unchecked("the short form has few models, and other versions of engines may be installed")
+
+CONVERSION = (
+    DocumentedTable(
+        "conversion-engines",
+        "export.md",
+        _CONVERSION,
+        "Engines",
+        {
+            "format": KEY,
+            "engine": _ROBOTS,
+            "files": _ROBOTS,
+            "all equal": SAME,
+            "refused": _ROBOTS,
+            "largest distance [m]": EXTREME,
+            "largest angle [rad]": EXTREME,
+        },
+        short_forms.conversion,
+    ),
+    DocumentedTable(
+        "conversion-models",
+        "export.md",
+        _CONVERSION,
+        "Models in each format",
+        {"model": KEY, **dict.fromkeys(("frames", "DoF", "URDF", "MJCF", "SDF"), SAME)},
+        short_forms.conversion,
+        has_all_rows=False,
+    ),
+)
+
+_CALIBRATION = "kineverse reproduce calibration"
+# Spreads of a root mean square over the parameters of a draw, which are correlated: measured. Errors of a
+# hand-eye calibration have long tails, those of OpenCV's above all.
+_OVER_BOUND = ByRow("calibrated", {"wheels": Mean(0.6, CALIBRATED_DRIVES), "": Mean(0.25, CALIBRATED_DRAWS)})
+_NEES = ByRow("calibrated", {"wheels": Mean(1.0, CALIBRATED_DRIVES), "": Mean(0.5, CALIBRATED_DRAWS)})
+_HAND_EYE = Mean(1.0, HAND_EYES)
+
+CALIBRATION = (
+    DocumentedTable(
+        "calibration-hand-eye",
+        "calibration.md",
+        _CALIBRATION,
+        "Pose of a camera",
+        {
+            "looks, spread": KEY,
+            "error": KEY,
+            "ours": _HAND_EYE,
+            **dict.fromkeys(("Tsai", "Park", "Horaud"), _HAND_EYE),
+            **dict.fromkeys(("Andreff", "Daniilidis"), Mean(4.0, HAND_EYES)),
+        },
+        short_forms.calibration,
+    ),
+    DocumentedTable(
+        "calibration",
+        "calibration.md",
+        _CALIBRATION,
+        "Errors of calibrated parameters",
+        {
+            "calibrated": KEY,
+            "parameters": SAME,
+            "draws": FEWER,
+            "error / bound": _OVER_BOUND,
+            "NEES / dof": _NEES,
+            "of a wheel [%]": ByRow("calibrated", {"wheels": Mean(0.6, CALIBRATED_DRIVES), "": SAME}),
+            "time [ms]": TIME,
+        },
+        short_forms.calibration,
+    ),
+)
+
+DOCUMENTED = (
+    *(*FIG4, *STURM, *STREAM, *JOINTS, *CALIBRATION, *MANIPULATION, *LOCKBOX, *BENCH, *DEPLOYMENT),
+    *(*CONVERSION, *CHECKS),
+)
 """All tables, in the order of the pages."""

@@ -28,6 +28,7 @@ Tables = list[tuple[str, Table]]
 FIG4_CONFIGURATIONS = 20
 STREAMS, STREAM_SECONDS = 1, 45.0
 TYPE_CASES = 12
+CALIBRATED_DRAWS, CALIBRATED_DRIVES, HAND_EYES = 4, 1, 4
 GRID_SAMPLES = 3
 LOCKBOXES = 20
 """Every ninth cell of the grid, with one sample."""
@@ -45,6 +46,14 @@ def as_tables(report: Report) -> Tables:
 def tables_of(*tables: ReportTable) -> Tables:
     """Return tables of a report that the short form does not make as a whole."""
     return as_tables(Report("", "", tables, {}, Figure(lambda canvas: None, (1.0, 1.0))))
+
+
+@cache
+def calibration() -> Tables:
+    """Calibrate few draws, and one drive without and with slips."""
+    from kineverse_studies.experiments.calibration import measure, report
+
+    return as_tables(report(*measure(_quiet, CALIBRATED_DRAWS, CALIBRATED_DRIVES, HAND_EYES, seed=1000)))
 
 
 @cache
@@ -149,6 +158,14 @@ def joint_types() -> Tables:
 
 
 @cache
+def conversion() -> Tables:
+    """Write and check a few of the models."""
+    from kineverse_studies.experiments import Options, reproduce
+
+    return as_tables(reproduce("conversion", options=Options(quick=True, processes=1)))
+
+
+@cache
 def estimation_grid() -> Tables:
     """Fit few samples of each cell."""
     from kineverse_studies.experiments import Options
@@ -204,6 +221,17 @@ def lockbox() -> Tables:
         make_planner_table(plans),
         make_unknown_table(unknown),
     )
+
+
+CHECK_SEED = 200  # first seed of the page; the checks were made with others
+
+
+@cache
+def checks() -> Tables:
+    """Break one model in each way, by the first seed of the page."""
+    from kineverse_studies.experiments import Options, reproduce
+
+    return as_tables(reproduce("checks", options=Options(seed=CHECK_SEED, count=1)))
 
 
 def has_data(folder: str) -> bool:

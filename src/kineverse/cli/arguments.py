@@ -289,6 +289,7 @@ def _suggest_unit(text: str, kind: str, lower: float, upper: float) -> str:
 
 MODULES: Mapping[str, str] = MappingProxyType(
     {
+        "check": "pydrake",
         "control": "daqp",
         "decomposition": "coacd",
         "exchange": "zenoh",

@@ -13,6 +13,7 @@ import numpy as np
 import kineverse as kv
 from kineverse.errors import InvalidValueError, KineverseError, UnknownNameError, suggest
 from kineverse.estimation import calibrate, read_looks
+from kineverse.estimation.calibration.calibration import SHOWN_UNITS, format_direction, format_size
 from kineverse.estimation.calibration.corrections import find_corrections
 from kineverse.expressions.printing import format_number
 from kineverse.symbols import parameter
@@ -30,7 +31,7 @@ from .convert import check_writable
 from .output import format_table, show_activity
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Sequence
 
     from kineverse.estimation import Calibration, LookTable
     from kineverse.model.registry import SaveResult
@@ -70,7 +71,6 @@ examples:
 
 UNTOLD = 1
 _SHOWN = 12  # number of gross errors listed
-_SHARE = 0.05  # least coefficient of a direction that is printed
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -286,12 +286,9 @@ def _parse_noise(text: str) -> dict[str, float]:
 
 # -- report --------------------------------------------------------------------------------------------------
 
-_SHOWN_UNITS = {"m": (1e3, "mm"), "rad": (math.degrees(1.0), "deg")}
-_GROUP_UNITS = {"position": "m", "point": "m", "orientation": "rad", "pixel": "px"}
-
 
 def _scaled(value: float, unit: str) -> tuple[float, str]:
-    factor, shown = _SHOWN_UNITS.get(unit, (1.0, unit))
+    factor, shown = SHOWN_UNITS.get(unit, (1.0, unit))
     return factor * value, shown
 
 
@@ -322,32 +319,21 @@ def _format(
         ("off now, in looks left out", found.held_out),
     ):
         if sizes:
-            rows.append([title, *(_format_size(sizes.get(g), g) for g in groups)])
+            rows.append([title, *(format_size(sizes[g], g) if g in sizes else "" for g in groups)])
     lines.append(format_table(head, rows, "<" + ">" * len(groups)))
     if found.outliers:
         looks = sorted({outlier.look for outlier in found.outliers})
         shown_lines = ", ".join(str(table.lines[k]) for k in looks[:_SHOWN])
         more = ", …" if len(looks) > _SHOWN else ""
-        lines.append(f"\ngross errors, left out: {len(found.outliers)}, in lines {shown_lines}{more}")
+        where = "line" if len(looks) == 1 else "lines"
+        lines.append(f"\ngross errors, left out: {len(found.outliers)}, in {where} {shown_lines}{more}")
     if found.unobservable:
         lines.append("\nnot told by these looks, and as before:")
-        lines += [f"  {_format_direction(direction)}" for direction in found.unobservable]
+        lines += [f"  {format_direction(direction)}" for direction in found.unobservable]
     if saved is not None:
         lines.append(f"\nwritten: {saved.path}")
         lines += [f"  {remark}" for remark in saved.remarks]
     return lines
-
-
-def _format_size(size: float | None, group: str) -> str:
-    if size is None:
-        return ""
-    number, shown = _scaled(size, _GROUP_UNITS.get(group, ""))
-    return f"{format_number(number, 3)} {shown}".rstrip()
-
-
-def _format_direction(direction: Mapping[str, float]) -> str:
-    largest = sorted(direction.items(), key=lambda item: -abs(item[1]))
-    return ", ".join(f"{name} {value:.2f}" for name, value in largest if abs(value) >= _SHARE)
 
 
 def _as_json(

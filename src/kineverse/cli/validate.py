@@ -4,9 +4,16 @@ from __future__ import annotations
 
 import argparse
 import json
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
+from kineverse.errors import InvalidValueError
+from kineverse.expressions.printing import format_number
 from kineverse.formats import ValidationResult, validate_file
+from kineverse.formats.validate import INVALID, VALID
+from kineverse.geometry.motion_checks.check import check_motion
+from kineverse.geometry.motion_checks.report import MotionFinding, MotionReport
 from kineverse.geometry.shapes import import_coal
 
 from .arguments import add_model_options
@@ -29,6 +36,15 @@ files. With --contacts, bodies that penetrate each other at the default state ar
 joint connects them; many valid models have some. Remarks name content that the reader left out, or
 interpreted in one of several ways.
 
+--motion moves each joint through its range, with the others at rest, and looks at what it moves. What is
+certainly wrong is a finding: degrees for radians, millimetres for metres, an axis far from the part and from
+all else, a joint that moves nothing, a part that floats, an impossible inertia, a centre of mass outside of
+the part, a mesh that is inside out, crossed limits. Suspects are worth a look and change no exit status: a
+part that enters its carrier or comes apart, a flipped or turned axis, a wrong scale or density. Links of
+robots are only suspects where their shapes say little. What lacks shapes is listed as what cannot be said.
+--pictures draws each of them where it is worst, the part in orange. With --json, "coordinates" lists them by
+stable kinds, for programs that generate models.
+
 The exit status is 0 without problems, 1 with problems, and 2 if a file cannot be read, or has mistakes; of
 several files, the worst.
 
@@ -37,7 +53,10 @@ examples:
   kineverse validate robots/*.urdf worlds/*.sdf
   kineverse validate robot.urdf --no-meshes --strict
   kineverse validate robot.urdf --contacts
-  kineverse validate home.kv.json --json"""
+  kineverse validate home.kv.json --json
+  kineverse validate cupboard.urdf --motion
+  kineverse validate cupboard.urdf --motion --pictures pictures
+  kineverse validate generated/*.urdf --motion --json"""
 
 SHOWN, SHOWN_OF_SEVERAL = 10, 3
 """Number of reader warnings, and of problems of a kind, printed for a file without --all."""
@@ -59,6 +78,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--contacts", action="store_true", help="bodies that penetrate each other are problems (needs coal)"
     )
+    parser.add_argument("--motion", action="store_true", help="move each joint over its range (needs coal)")
+    pictures = "with --motion: folder for a PNG of each finding and suspect"
+    parser.add_argument("--pictures", metavar="FOLDER", type=Path, help=pictures)
     add_model_options(parser, "remarks count as problems")
     parser.add_argument(
         "--all", action="store_true", help=f"print all remarks and problems, not {SHOWN} of a kind"
@@ -69,24 +91,134 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Validate the files, print the results, and return the worst status."""
     files = show_progress(arguments.files, "validating", "file")
-    if arguments.contacts:
+    if arguments.contacts or arguments.motion:
         import_coal()
+    if arguments.pictures is not None:
+        if not arguments.motion:
+            raise InvalidValueError("--pictures shows what --motion finds. Add --motion.")
+        arguments.pictures.mkdir(parents=True, exist_ok=True)
     options = {"meshes": not arguments.no_meshes, "strict": arguments.strict, "root": arguments.root}
     further = find_penetrations if arguments.contacts else None
     results = [validate_file(file, loops=arguments.loops, further=further, **options) for file in files]
-    status = max(result.status for result in results)
+    motions = [check_result(result, arguments.pictures) for result in results] if arguments.motion else []
+    if motions:
+        results = [_without_inertia(result) for result in results]
+    statuses = [result.status for result in results]
+    for k, motion in enumerate(motions):
+        statuses[k] = max(statuses[k], VALID if motion is None or motion.report.ok else INVALID)
+    status = max(statuses)
     most = None if arguments.all else SHOWN if len(results) == 1 else SHOWN_OF_SEVERAL
     if arguments.json:
-        answer = {"status": status, "files": [validation_to_json(result) for result in results]}
-        print(json.dumps(answer, allow_nan=False))
+        answer = {
+            "status": status,
+            "files": [
+                validation_to_json(result) | {"status": one}
+                for result, one in zip(results, statuses, strict=True)
+            ],
+        }
+        print(json.dumps(answer | motions_to_json(results, motions), allow_nan=False))
     elif len(results) > 1:
         details = [format_validation(result, most) for result in results if result.status]
         print("\n\n".join([_format_results(results), *("\n".join(lines) for lines in details)]))
+        for result, motion in zip(results, motions, strict=True) if motions else ():
+            if motion is not None and motion.has_entries:
+                print("\n".join(["", f"{result.name}:", *format_motion(motion, most)]))
     elif results[0].error is not None:
         raise results[0].error
     else:
         print("\n".join(format_validation(results[0], most)))
+        for motion in motions:
+            if motion is not None:
+                print("\n".join(format_motion(motion, most)))
     return status
+
+
+@dataclass(frozen=True)
+class CheckedMotion:
+    """Report of a file's motions, and the pictures of it: name of the coordinate, kind, and file."""
+
+    report: MotionReport
+    pictures: tuple[tuple[str, str, Path], ...] = ()
+
+    @property
+    def has_entries(self) -> bool:
+        """True if there is a finding or a suspect."""
+        return bool(self.report.findings or self.report.suspects)
+
+
+def check_result(result: ValidationResult, folder: Path | None) -> CheckedMotion | None:
+    """Check the motions of a file, and draw what is found; None for a file that cannot be read."""
+    if result.model is None:
+        return None
+    report = check_motion(result.model, result.faults)
+    if folder is None:
+        return CheckedMotion(report)
+    from kineverse.view.finding_pictures import save_finding_pictures  # for start-up time
+
+    return CheckedMotion(report, tuple(save_finding_pictures(result.model, report, folder)))
+
+
+def _without_inertia(result: ValidationResult) -> ValidationResult:
+    """Return a result without the inertias, which the report of motions has with their coordinates."""
+    return replace(result, problems=[p for p in result.problems if p.kind != "inertia"])
+
+
+def format_motion(motion: CheckedMotion, most: int | None) -> list[str]:
+    """Return the report of motions as lines, at most so many of a severity."""
+    report = motion.report
+    counts = {"finding": len(report.findings), "suspect": len(report.suspects)}
+    said = ", ".join(format_count(count, noun) for noun, count in counts.items() if count) or "nothing wrong"
+    style = "!" if report.findings else "~" if report.suspects else "+"
+    lines = [f"  motion of {format_count(len(report.coordinates), 'coordinate')}: {colorize(said, style)}"]
+    for title, severity in (("findings", "finding"), ("suspects", "suspect"), ("cannot say", "cannot_say")):
+        entries = [
+            (one.name, entry) for one in report.all for entry in one.entries if entry.severity == severity
+        ]
+        texts = [line for name, entry in entries for line in [_format_entry(name, entry)]]
+        if texts:
+            lines += [f"  {title}", *truncate_lines(texts, most, "    ")]
+    if motion.pictures:
+        folder = motion.pictures[0][2].parent
+        lines.append(f"  {format_count(len(motion.pictures), 'picture')} in {folder}")
+    return lines
+
+
+def _format_entry(name: str, entry: MotionFinding) -> str:
+    """Return the reason on one line, and below it the numbers and what to do."""
+    where = f" ({entry.joint})" if entry.joint and entry.joint != name else ""
+    first = f"    {name}{where}: {entry.text}" if name else f"    {entry.text}"
+    numbers = [f"at {key} = {format_number(value)}" for key, value in entry.state.items()]
+    if entry.severity == "cannot_say" or not (entry.advice or numbers):
+        return first
+    if entry.value is not None and entry.limit is not None:
+        pair = (
+            f"{format_number(entry.value, 3)} {entry.unit}",
+            f"{format_number(entry.limit, 3)} {entry.unit}",
+        )
+        numbers.append(f"{pair[0]}, where {pair[1]} is accepted")
+    return f"{first}\n      {'; '.join(filter(None, [*numbers, entry.advice]))}"
+
+
+def motions_to_json(results: list[ValidationResult], motions: list[CheckedMotion | None]) -> dict[str, Any]:
+    """Return the reports of motions as JSON data: all coordinates with their files, and bodies at rest."""
+    if not motions:
+        return {}
+    coordinates: list[dict[str, Any]] = []
+    at_rest: list[dict[str, Any]] = []
+    for result, motion in zip(results, motions, strict=True):
+        for one in motion.report.all if motion is not None else ():
+            pictures = (
+                [
+                    {"kind": kind, "file": str(path)}
+                    for name, kind, path in motion.pictures
+                    if name == one.name
+                ]
+                if motion is not None
+                else []
+            )
+            data = one.to_json() | {"file": result.name, "pictures": pictures}
+            (coordinates if one.name else at_rest).append(data)
+    return {"coordinates": coordinates, "at_rest": at_rest}
 
 
 def format_validation(found: ValidationResult, most: int | None) -> list[str]:

@@ -24,7 +24,7 @@ from .c_library import ProgramLibrary, cores, open_library, parallel_rows
 from .codegen import BATCH_KIND, generate_batch_source, missing_operations
 from .evaluator import bind
 from .program import CasadiFunction, Program
-from .signature import Signature, as_doubles
+from .signature import as_doubles
 from .toolchain import vector_optimisation_level
 
 _CACHE_LINE = 64
@@ -103,11 +103,8 @@ class Batch:
     Programs with other operations stay with CasADi's map over the function of single calls.
     """
 
-    def __init__(
-        self, program: Program, signature: Signature, shapes: Sequence[ArrayShape], single: bool, tier: str
-    ) -> None:
+    def __init__(self, program: Program, shapes: Sequence[ArrayShape], single: bool, tier: str) -> None:
         self._program = program
-        self._signature = signature
         self._shapes = shapes
         self._single = single
         self._insist = tier == "c"
@@ -141,6 +138,12 @@ class Batch:
             self._check(points, results)
         return results[0] if self._single else tuple(results)
 
+    def request(self) -> None:
+        """Request compilation in the background, before it pays."""
+        if self._library is not None:
+            self._code(0)  # an error if C is required and impossible
+            self._library.request()
+
     def _check(self, points: Array, results: Sequence[Array]) -> None:
         rows = np.logical_or.reduce([np.isnan(r).reshape(len(points), -1).any(axis=1) for r in results])
         for row in np.flatnonzero(rows):
@@ -150,7 +153,7 @@ class Batch:
                 raise NoSolutionError(f"Row {row}: {error}") from None
 
     def _points(self, x: npt.ArrayLike) -> Array:
-        size = self._signature.size
+        size = self._program.size
         wanted = f"an array of shape (N, {size}), a configuration per row"
         points = as_doubles(x, wanted)
         if points.ndim != 2 or points.shape[1] != size:

@@ -84,12 +84,12 @@ class ProgramLibrary(Generic[Code]):
         elif level is None:
             self.error = f"{program.instructions} operations are too many for a C compiler"
         else:
-            self._key = program.key(kind, self._toolchain.identity, level)
+            self.key = program.key(kind, self._toolchain.identity, level)
 
     def find(self) -> bool:
         """Load the library from the cache, and return True if it is loaded."""
         if self.code is None and self.error is None:
-            self.code = library_cache().load(self._key, self._load)
+            self.code = library_cache().load(self.key, self._load)
         return self.code is not None
 
     def request(self, urgent: bool = False) -> None:
@@ -97,7 +97,7 @@ class ProgramLibrary(Generic[Code]):
         if self.code is not None or self.error is not None or self._toolchain is None:
             return
         if self._build is None or self._build.done:
-            self._build = request(self._key, self._toolchain, self._source, self._flags, self._built, urgent)
+            self._build = request(self.key, self._toolchain, self._source, self._flags, self._built, urgent)
 
     def wait(self, timeout: float | None = None) -> bool:
         """Wait until the library is loaded or has failed, and return True if it is loaded."""
@@ -111,7 +111,7 @@ class ProgramLibrary(Generic[Code]):
 
     def _built(self, build: BuildJob) -> None:
         if build.path is not None and self.code is None:
-            self.code = build.cache.load(self._key, self._load)
+            self.code = build.cache.load(self.key, self._load)
         if self.code is None and not build.forgotten:
             self.error = build.error or "its library cannot be loaded"
         notify = self._ready() if self._ready is not None else None

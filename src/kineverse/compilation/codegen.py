@@ -36,7 +36,7 @@ class Dialect(Struct, frozen=True):
     written: str  # vector of a value {}
 
 
-_SAME = {
+ARITHMETIC = {
     ca.OP_ASSIGN: "{a}",
     ca.OP_LIFT: "{a}",
     ca.OP_ADD: "{a} + {b}",
@@ -46,8 +46,8 @@ _SAME = {
     ca.OP_NEG: "-{a}",
     ca.OP_SQ: "{a} * {a}",
 }
-# Functions of the C library, and with an underline behind the name, of vectors.
-_UNARY = {
+# Functions of the C library and of arrays, and with an underline behind the name, of vectors.
+UNARY_FUNCTIONS = {
     ca.OP_TAN: "tan",
     ca.OP_ASIN: "asin",
     ca.OP_ACOS: "acos",
@@ -64,7 +64,7 @@ _UNARY = {
     ca.OP_ERF: "erf",
     ca.OP_LOG1P: "log1p",
 }
-_BINARY = {
+BINARY_FUNCTIONS = {
     ca.OP_ATAN2: "atan2",
     ca.OP_POW: "pow",
     ca.OP_CONSTPOW: "pow",
@@ -72,7 +72,7 @@ _BINARY = {
     ca.OP_REMAINDER: "remainder",
     ca.OP_HYPOT: "hypot",
 }
-_COMPARISONS = {ca.OP_LT: "{a} < {b}", ca.OP_LE: "{a} <= {b}", ca.OP_EQ: "{a} == {b}", ca.OP_NE: "{a} != {b}"}
+COMPARISONS = {ca.OP_LT: "{a} < {b}", ca.OP_LE: "{a} <= {b}", ca.OP_EQ: "{a} == {b}", ca.OP_NE: "{a} != {b}"}
 _CIRCLE = (ca.OP_SIN, ca.OP_COS)
 
 VECTOR = Dialect(
@@ -81,9 +81,9 @@ VECTOR = Dialect(
     literal="splat({})",
     truth="truth({})",
     plain={
-        **_SAME,
-        **{op: f"{name}_({{a}})" for op, name in _UNARY.items()},
-        **{op: f"{name}_({{a}}, {{b}})" for op, name in _BINARY.items()},
+        **ARITHMETIC,
+        **{op: f"{name}_({{a}})" for op, name in UNARY_FUNCTIONS.items()},
+        **{op: f"{name}_({{a}}, {{b}})" for op, name in BINARY_FUNCTIONS.items()},
         ca.OP_TWICE: "splat(2.0) * {a}",
         ca.OP_INV: "splat(1.0) / {a}",
         ca.OP_SQRT: "root({a})",
@@ -96,7 +96,7 @@ VECTOR = Dialect(
         ca.OP_FMAX: "larger({a}, {b})",
     },
     conditions={
-        **_COMPARISONS,
+        **COMPARISONS,
         ca.OP_NOT: "~is_true({a})",
         ca.OP_AND: "is_true({a}) & is_true({b})",
         ca.OP_OR: "is_true({a}) | is_true({b})",
@@ -114,9 +114,9 @@ SCALAR = Dialect(
     literal="({})",
     truth="{}",
     plain={
-        **_SAME,
-        **{op: f"{name}({{a}})" for op, name in _UNARY.items()},
-        **{op: f"{name}({{a}}, {{b}})" for op, name in _BINARY.items()},
+        **ARITHMETIC,
+        **{op: f"{name}({{a}})" for op, name in UNARY_FUNCTIONS.items()},
+        **{op: f"{name}({{a}}, {{b}})" for op, name in BINARY_FUNCTIONS.items()},
         ca.OP_TWICE: "2.0 * {a}",
         ca.OP_INV: "1.0 / {a}",
         ca.OP_SQRT: "sqrt({a})",
@@ -130,7 +130,7 @@ SCALAR = Dialect(
         ca.OP_FMAX: "{a} >= {b} || {b} != {b} ? {a} : {b}",
     },
     conditions={
-        **_COMPARISONS,
+        **COMPARISONS,
         ca.OP_NOT: "{a} == 0.0",
         ca.OP_AND: "({a} != 0.0) & ({b} != 0.0)",
         ca.OP_OR: "({a} != 0.0) | ({b} != 0.0)",
@@ -156,7 +156,12 @@ _KNOWN = {
 def missing_operations(program: Program) -> list[str]:
     """Return the names, as CasADi writes them, of a program's operations without a version for vectors."""
     unknown = program.operations - _KNOWN
-    return sorted(_OPERATION_NAMES.get(op, f"operation {op}") for op in unknown)
+    return sorted(map(operation_name, unknown))
+
+
+def operation_name(op: int) -> str:
+    """Return the name of an operation, as CasADi writes it."""
+    return _OPERATION_NAMES.get(op, f"operation {op}")
 
 
 _OPERATION_NAMES = {
@@ -257,11 +262,11 @@ BATCH_KIND = "batch 5 " + hashlib.sha256(
 ).hexdigest()  # fmt: skip
 
 
-def generate_batch_source(program: Program) -> str:
+def generate_batch_source(program: Program, file: str = "batch.c") -> str:
     """Return the C source of ``kineverse_batch``, which evaluates a program at many points.
 
     Its arguments are the rows of inputs, a pointer to the rows of each output, the number of rows, and a flag
-    to write the outputs past the caches.
+    to write the outputs past the caches. ``file`` is the hand-written file, or one that includes it.
     """
     whole = read_instructions(program.function)
     # Constants are written once, and not for each vector.
@@ -275,6 +280,7 @@ def generate_batch_source(program: Program) -> str:
         "RESULTS": sum(program.sizes),
         "STORED": plan.stored,
         "CONSTANTS": len(constants),
+        "OPERATIONS": program.instructions,
         "SIZES": ", ".join(map(str, program.sizes)),
     }
     numbers = ", ".join(["0", *(c_literal(c) for _, c in constants)])
@@ -285,4 +291,4 @@ def generate_batch_source(program: Program) -> str:
         f"static const double constant[] = {{{numbers}}};",
         f"static const int constant_place[] = {{{places}}};",
     ]
-    return read_source("batch.c", {"program.h": "\n".join(lines)})
+    return read_source(file, {"program.h": "\n".join(lines)})

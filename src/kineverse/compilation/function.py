@@ -249,7 +249,7 @@ class CompiledFunction(Generic[Results]):
         if self._batch is None:
             from .batch import Batch
 
-            self._batch = Batch(self._program, self._signature, self.shapes, self._single, self._wanted)
+            self._batch = Batch(self._program, self.shapes, self._single, self._wanted)
         results: Results = self._batch(x, out, self._function)
         return results
 

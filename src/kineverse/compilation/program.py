@@ -60,7 +60,7 @@ class Program:
         self.instructions: int = self._graph().n_instructions()
         # Closed loops, which may have no solution.
         self.implicit = implicit_nodes(outputs)
-        self._symbols = tuple(inputs)
+        self._symbols = tuple(inputs) if self.implicit else ()  # for errors about them
 
     @cached_property
     def _digest(self) -> hashlib._Hash:

@@ -95,13 +95,15 @@ class Signature:
         return f"{self.size} numbers ({_listed(self.names, 6)})" if self.size else "no numbers"
 
 
-def make_signature(outputs: Sequence[Expression], inputs: Iterable[Symbol] | None) -> Signature:
-    """Return the signature of a function of ``outputs``."""
+def make_signature(
+    outputs: Sequence[Expression], inputs: Iterable[Symbol] | None, call: str = "compile(outputs, inputs)"
+) -> Signature:
+    """Return the signature of a function of ``outputs``; ``call`` is that of the caller, for errors."""
     needed = set().union(*(e.symbols for e in outputs))
     if inputs is None:
         result = Signature(tuple(sorted(needed, key=lambda s: s.sort_key)))
     else:
-        result = Signature(_symbols(inputs))
+        result = Signature(_symbols(inputs, call))
         missing = needed.difference(result.inputs)
         if missing:
             names = sorted(str(s) for s in missing)
@@ -137,8 +139,8 @@ def as_doubles(x: Any, wanted: str) -> Array:
     return array.astype(np.float64, copy=False)
 
 
-def _symbols(inputs: Iterable[Symbol]) -> tuple[Symbol, ...]:
-    question = "Were outputs and inputs swapped? It is compile(outputs, inputs)."
+def _symbols(inputs: Iterable[Symbol], call: str) -> tuple[Symbol, ...]:
+    question = f"Were outputs and inputs swapped? It is {call}."
     if isinstance(inputs, Symbol):
         raise ExpressionError(f"Inputs are a sequence of symbols: write [{inputs}] for only one. {question}")
     if isinstance(inputs, (Expression, str)) or not isinstance(inputs, Iterable):

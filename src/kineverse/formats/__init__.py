@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     )
     from .loader import load as load
     from .locate import locate_model as locate_model, shipped_models as shipped_models
+    from .reader_warnings import collect_warnings as collect_warnings
     from .srdf import read_srdf as read_srdf
     from .validate import ValidationResult as ValidationResult, validate_file as validate_file
 

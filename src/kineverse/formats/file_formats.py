@@ -74,6 +74,13 @@ def list_file_formats() -> tuple[FileFormat, ...]:
             loop_element="joint",
         ),
         FileFormat(
+            name="PartNet-Mobility",
+            suffixes=("mobility_v2.json",),
+            read=f"{formats}.partnet.operations:partnet_file_operations",
+            folder_file="mobility_v2.json",
+            reference=b"[",  # meshes are named by result.json beside it
+        ),
+        FileFormat(
             name="xacro",
             suffixes=(".xacro",),
             read=f"{formats}.xacro:xacro_file_operations",

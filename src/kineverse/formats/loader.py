@@ -26,8 +26,8 @@ from .reader_warnings import collect_warnings, warn
 from .root_folder import NOWHERE, find_root
 
 READ = (
-    "URDF (.urdf, .xml), SDF (.sdf, .world), MJCF (.xml, .mjcf), USD (.usda, .usdc, .usd), templates of "
-    "xacro (.xacro) and documents (.kv.json, .kv.msgpack)"
+    "URDF (.urdf, .xml), SDF (.sdf, .world), MJCF (.xml, .mjcf), USD (.usda, .usdc, .usd), PartNet-Mobility "
+    "(mobility_v2.json), templates of xacro (.xacro) and documents (.kv.json, .kv.msgpack)"
 )
 
 _MESHES = (".stl", ".obj", ".dae", ".ply", ".glb", ".gltf", ".off", ".3mf", ".msh")
@@ -94,10 +94,11 @@ def load(
     Parameters
     ----------
     source
-        Path of a ``.urdf``, ``.sdf``, ``.xml`` (MJCF, or URDF), ``.xacro``, ``.kv.json`` or ``.kv.msgpack``
-        file, or a name such as ``kitchen``, ``pr2`` or ``articulations/screw``, see
-        :func:`kineverse.formats.locate.locate_model`. ``live:NAME`` is a model that other processes edit as
-        well: the result follows it, and edits of the result are theirs.
+        Path of a ``.urdf``, ``.sdf``, ``.xml`` (MJCF, or URDF), ``.usda``, ``.xacro``, ``.kv.json`` or
+        ``.kv.msgpack`` file, or of a ``mobility_v2.json`` or its folder; or a name such as ``kitchen``,
+        ``pr2`` or ``articulations/screw``, see :func:`kineverse.formats.locate.locate_model`. ``live:NAME``
+        is a model that other processes edit as well: the result follows it, and edits of the result are
+        theirs.
     prefix
         Prefix of the names of all frames and degrees of freedom, without the slash. A shipped model has its
         own name as prefix unless another is given (``screw`` for ``articulations/screw``); ``""`` means none.

@@ -86,6 +86,10 @@ def locate_model(name: str | os.PathLike[str]) -> Source:
     path = _expanded(text)
     if _is(path, Path.is_file):
         return Source(path.resolve())
+    if _is(path, Path.is_dir):
+        inside = registry.find_folder_file(path)
+        if inside is not None:
+            return Source(inside.resolve())
     explicit = path.is_absolute() or text.startswith(".") or text.endswith(registry.readable_suffixes())
     if explicit and not _is(path, Path.is_dir) and _is(path, os.path.lexists):
         raise FormatError(

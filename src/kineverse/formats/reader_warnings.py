@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 
@@ -27,6 +27,19 @@ class ChangedMotion(Fault):
     __slots__ = ()
 
 
+class CrossedLimits(Fault):
+    """Fault of a joint whose lower limit is above its upper one; ``joint`` is its name in the file."""
+
+    joint: str = ""
+
+    @classmethod
+    def of(cls, joint: str, text: str) -> CrossedLimits:
+        """Return the fault of a joint."""
+        fault = cls(text)
+        fault.joint = joint
+        return fault
+
+
 class ReaderWarnings(Struct):
     """Warnings about one document; with ``strict``, mistakes raise instead."""
 
@@ -41,14 +54,20 @@ class ReaderWarnings(Struct):
         self.texts.append(remark)
         warn([f"{self.source}, {remark}"])
 
-    def repair(self, mistake: ElementError, taken: str, owner: Element | None = None) -> None:
+    def repair(
+        self,
+        mistake: ElementError,
+        taken: str,
+        owner: Element | None = None,
+        kind: Callable[[str], Fault] = Fault,
+    ) -> None:
         """Add a warning about a mistake in a part of ``owner``, with the value used instead."""
         if self.strict:
             raise mistake
         element = mistake.element
         owner = owner or element
         of = "" if owner is element else f"{label(element)} "
-        self.fault(element[3], f"{label(owner)}: {of}{mistake.message.rstrip('. ')}; {taken}.")
+        self.fault(element[3], f"{label(owner)}: {of}{mistake.message.rstrip('. ')}; {taken}.", kind)
 
     @contextmanager
     def passing_over(self, owner: Element | None = None) -> Iterator[None]:
@@ -64,7 +83,7 @@ class ReaderWarnings(Struct):
             raise FormatError(f"{self.source}, line {line}, {text}")
         self.fault(line, f"{text.rstrip('.')}; {taken}.")
 
-    def fault(self, line: int, text: str, kind: type[Fault] = Fault) -> None:
+    def fault(self, line: int, text: str, kind: Callable[[str], Fault] = Fault) -> None:
         """Add a warning about a mistake in a line."""
         self.texts.append(kind(f"line {line}, {text}"))
         warn([kind(f"{self.source}, {self.texts[-1]}")])

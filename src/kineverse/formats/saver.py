@@ -32,8 +32,8 @@ def save(
 ) -> SaveResult:
     """Write a model to a file in the format of its ending.
 
-    The file is replaced atomically; after an error, the old file is unchanged. URDF and MJCF are read again
-    before that, MJCF by MuJoCo if it is installed. Meshes that MuJoCo cannot read are converted, into a
+    The file is replaced atomically; after an error, the old file is unchanged. URDF, MJCF and SDF are read
+    again before that, MJCF by MuJoCo if it is installed. Meshes that MuJoCo cannot read are converted, into a
     folder next to the file.
     """
     target = _target(path)

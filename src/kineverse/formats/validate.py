@@ -170,7 +170,14 @@ def _find_missing_meshes(model: ModelView) -> Iterator[ModelProblem]:
                 yield ModelProblem("mesh", name, missing[mesh])
 
 
-_FORMATS = {".kv.json": "document", ".urdf": "URDF", ".sdf": "SDF", ".world": "SDF", ".mjcf": "MJCF"}
+_FORMATS = {
+    ".kv.json": "document",
+    ".urdf": "URDF",
+    ".sdf": "SDF",
+    ".world": "SDF",
+    ".mjcf": "MJCF",
+    "mobility_v2.json": "PartNet-Mobility",
+}
 
 VALID, INVALID, UNREADABLE = 0, 1, 2  # values of ValidationResult.status
 

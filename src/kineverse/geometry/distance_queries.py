@@ -37,9 +37,11 @@ def find_distance(world: CollisionWorld, a: str, b: str) -> DistanceResult:
     if len(pairs) > 1:
         # The distance of the most promising pair bounds the answer from above.
         lows = world.table.lower_bounds(pairs[:, 0], pairs[:, 1])
-        (promising,), _ = world.measure(pairs[[np.argmin(lows)]], np.zeros(1), math.inf)
+        first = np.argmin(lows)
+        (promising,), _ = world.measure(pairs[[first]], np.zeros(1), math.inf)
         radius = float(promising) + ACCURACY
         near = lows <= radius
+        near[first] = True  # triangles may be reported deeper than their boxes overlap
         pairs, lows = pairs[near], lows[near]
     (result,) = _nearest_pairs(world, pairs, lows, radius)
     return result if result.a == a else result.swap()

@@ -86,6 +86,25 @@ def moved_frames(model: ModelView, symbols: Iterable[Symbol | str]) -> dict[Symb
     return result
 
 
+def moving_symbols(model: ModelView, symbols: Iterable[Symbol | str]) -> dict[str, tuple[Symbol, ...]]:
+    """Return which of some symbols move each frame in its parent, for the frames that any of them moves.
+
+    The symbols are compared as in :class:`FrameDependence`. The frames are in the order of the model.
+    """
+    asked = [s if isinstance(s, Symbol) else model.symbol(s) for s in symbols]
+    known = _known_paths(model)
+    movers: dict[str, list[Symbol]] = {}
+    for symbol in asked:
+        for path in _driven_coordinates(model, {_known_path(symbol, known)}):
+            movers.setdefault(path, []).append(symbol)
+    result: dict[str, tuple[Symbol, ...]] = {}
+    for name, frame in model.frames.items():
+        found = {s for path in _paths_in_parent(frame) for s in movers.get(path, ())}
+        if found:
+            result[name] = tuple(s for s in asked if s in found)
+    return result
+
+
 def count_moved_bodies(model: ModelView, symbols: Iterable[Symbol | str]) -> dict[Symbol, int]:
     """Return the number of bodies with shapes or inertia that each symbol moves, see :func:`moved_frames`."""
     bodies = {name for name, body in model.bodies.items() if not is_empty_body(body)}

@@ -515,16 +515,16 @@ class ModelView(SymbolicView):
         leave_out: Iterable[str] = (),
         strict: bool = False,
     ) -> SaveResult:
-        """Write the model to a file: a document (.kv.json), URDF (.urdf) or MJCF (.xml).
+        """Write the model to a file: a document (.kv.json), URDF (.urdf), MJCF (.xml) or SDF (.sdf).
 
-        A document contains the whole model. URDF and MJCF cannot express all motions and constraints: motions
+        A document contains the whole model. The others cannot express all motions and constraints: motions
         are refused by name, constraints are left out with a remark; see :func:`kineverse.formats.saver.save`.
 
         Parameters
         ----------
         tolerance
-            Largest error of a frame in URDF and MJCF, in position [m] and angle [rad], guaranteed; None for
-            no error.
+            Largest error of a frame in such a file, in position [m] and angle [rad], guaranteed; None for no
+            error.
         leave_out
             Names of constraints and articulations to leave out.
         strict

@@ -72,6 +72,7 @@ class FileFormat(Struct, frozen=True):
     recognize: Callable[[str, bytes], bool] | None = None  # of (name, content), where formats share a suffix
     exact: bool = False  # True if files hold all of a model; then write is a function of (model, path)
     engine: str = ""  # class that reads files of the format on its own, to compare poses; empty for none
+    folder_file: str = ""  # name of the file that stands for its folder; empty if none does
     loop_element: str = ""  # element of the format that closes a loop; empty if the format has none
     reference: bytes = b""  # text in every file that refers to further files; empty if files never do
 
@@ -250,6 +251,12 @@ def find_scheme(source: object) -> Scheme | None:
 def find_format(name: str, content: bytes) -> FileFormat | None:
     """Return the format of a file; None if no registered format reads it."""
     return next((one for one in list_formats() if one.reads(name, content)), None)
+
+
+def find_folder_file(folder: Path) -> Path | None:
+    """Return the file that stands for a folder, such as that of an object of PartNet-Mobility."""
+    files = (folder / one.folder_file for one in list_formats() if one.folder_file)
+    return next((file for file in files if file.is_file()), None)
 
 
 def find_writer(name: str) -> FileFormat | None:

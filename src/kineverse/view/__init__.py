@@ -17,6 +17,7 @@ from kineverse._lazy import lazy_face
 
 if TYPE_CHECKING:
     from .camera import Camera as Camera
+    from .finding_pictures import draw_finding as draw_finding
     from .page import show as show, view as view
     from .pictures import picture as picture, save_picture as save_picture
 

@@ -24,6 +24,7 @@ FRONT = 0.62  # preferred direction: in front of the model and a little to its l
 TRIALS = 12
 
 TRIAL_HEIGHT = 80  # height of trial pictures [pixels]: enough to show a handle, small enough for a dozen
+AZIMUTHS, PART_ELEVATION = 8, 0.45  # directions from which single parts are looked at [rad]
 MOVING_WEIGHT = 4.0  # weight of a part that moves, relative to one that does not
 
 
@@ -58,6 +59,33 @@ def choose_camera(
         trials.append((score, -k))
     azimuth = FRONT - 2 * np.pi * max(trials)[1] / TRIALS
     return fit_camera(points, azimuth, ELEVATION, aspect, field_of_view)
+
+
+def choose_camera_for_parts(
+    items: Sequence[Drawable],
+    places: Sequence[Mapping[str, Floats]],
+    weights: npt.NDArray[np.float64],
+    aspect: float,
+    margin: float = 0.08,
+) -> Camera:
+    """Return the camera that has the parts with weights in view in some states, and shows most of them."""
+    scenes = [TriangleSoup.from_drawables(items, place) for place in places]
+    corners = [scene.corners.astype(np.float32) for scene in scenes]
+    points = np.concatenate([scene.corners[weights[scene.source] > 0.0].reshape(-1, 3) for scene in scenes])
+    extreme = find_extreme_points(points)
+    best, chosen = -1.0, None
+    for azimuth in np.linspace(0.0, 2 * np.pi, AZIMUTHS, endpoint=False).tolist():
+        camera = fit_camera(extreme, azimuth, PART_ELEVATION, aspect, margin=margin)
+        projection = Projection.from_camera(camera, int(TRIAL_HEIGHT * aspect), TRIAL_HEIGHT)
+        score = 0.0
+        for scene, triangles in zip(scenes, corners, strict=True):
+            seen, _ = rasterize(projection, triangles, scene.closed)
+            area = np.bincount(scene.source[seen[seen >= 0]], minlength=len(weights))
+            score += float(weights @ np.log1p(area))
+        if score > best:
+            best, chosen = score, camera
+    assert chosen is not None
+    return chosen
 
 
 def reframe(camera: Camera, points: Floats, aspect: float) -> Camera:

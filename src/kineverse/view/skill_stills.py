@@ -15,18 +15,14 @@ from kineverse.symbols import Symbol
 from kineverse.worlds import Robot
 from kineverse.worlds.robot_interface import SkillStep
 
-from .auto_camera import TRIAL_HEIGHT, find_extreme_points
-from .camera import Camera, fit_camera
+from .auto_camera import choose_camera_for_parts
 from .drawables import Drawable, collect_drawables
 from .pictures import draw_picture, join_pictures, write_png
 from .poses import FramePoses
-from .rasterizer import Projection, TriangleSoup, rasterize
 from .run_overlay import RunDrawing, RunMoment
 from .triangle_mesh import Floats
 
 SIZE = (400, 300)  # size of a still [pixels]
-_AZIMUTHS, _ELEVATION = 8, 0.45
-_FIELD_OF_VIEW = 0.6
 _MOVED, _ROBOT = 2.0, 1.0  # weights of the object and of the robot in the choice of a camera
 
 
@@ -96,7 +92,7 @@ class SkillStills:
         ]
         moved = {*moved_frames(self._model, [coordinate])[coordinate]}
         weights = np.array([self._weigh(part, moved) for part in items])
-        camera = _choose_camera(items, places, weights)
+        camera = choose_camera_for_parts(items, places[:2], weights, SIZE[0] / SIZE[1])
         images = []
         for still, place in zip(row, places, strict=True):
             ghosts = {} if still.belief is None else self._drawing.find_ghosts(still.shown, still.belief)
@@ -109,26 +105,3 @@ class SkillStills:
         if part.frame in moved:
             return _MOVED
         return _ROBOT if self._robot.owns(part.frame) else 0.0
-
-
-def _choose_camera(
-    items: list[Drawable], places: list[dict[str, Floats]], weights: npt.NDArray[np.float64]
-) -> Camera:
-    """Return the camera that shows most of the parts with weights in the first two states."""
-    scenes = [TriangleSoup.from_drawables(items, place) for place in places[:2]]
-    corners = [scene.corners.astype(np.float32) for scene in scenes]
-    points = np.concatenate([scene.corners[weights[scene.source] > 0.0].reshape(-1, 3) for scene in scenes])
-    extreme, aspect = find_extreme_points(points), SIZE[0] / SIZE[1]
-    best, chosen = -1.0, None
-    for azimuth in np.linspace(0.0, 2 * np.pi, _AZIMUTHS, endpoint=False).tolist():
-        camera = fit_camera(extreme, azimuth, _ELEVATION, aspect, _FIELD_OF_VIEW)
-        projection = Projection.from_camera(camera, int(TRIAL_HEIGHT * aspect), TRIAL_HEIGHT)
-        score = 0.0
-        for scene, triangles in zip(scenes, corners, strict=True):
-            seen, _ = rasterize(projection, triangles, scene.closed)
-            area = np.bincount(scene.source[seen[seen >= 0]], minlength=len(weights))
-            score += float(weights @ np.log1p(area))
-        if score > best:
-            best, chosen = score, camera
-    assert chosen is not None
-    return chosen

@@ -166,10 +166,18 @@ class Benchmark:
         self.measured[name] = Measurement(name, unit, tuple(map(float, samples)))
         return self.measured[name]
 
-    def speed(self, ours: str | Iterable[str], *theirs: str, at_least: float | None = None) -> None:
+    def speed(
+        self,
+        ours: str | Iterable[str],
+        *theirs: str,
+        at_least: float | None = None,
+        at_most: float | None = None,
+    ) -> None:
         """Compare contenders with peers, see :func:`compare_speed`."""
         for one in (ours,) if isinstance(ours, str) else ours:
-            self.comparisons += [compare_speed(self.measured, one, peer, at_least) for peer in theirs]
+            self.comparisons += [
+                compare_speed(self.measured, one, peer, at_least, at_most) for peer in theirs
+            ]
 
     def bound(self, limit: float, *names: str) -> None:
         self.comparisons += [bound_median(self.measured[name], limit) for name in names]
@@ -191,7 +199,7 @@ DISTRIBUTIONS: Mapping[str, str] = {
     "vamp": "vamp-planner",
 }
 """Distributions of modules with another name."""
-PEERS_EXTRA = ("pinocchio", "mujoco", "pybullet", "pink", "mink", "ompl")
+PEERS_EXTRA = ("pinocchio", "mujoco", "pybullet", "pink", "mink", "ompl", "jaxadi")
 """Modules that the extra ``peers`` installs."""
 
 
@@ -319,10 +327,15 @@ class BenchmarkResult:
 
 
 def compare_speed(
-    measured: Mapping[str, Measurement], ours: str, theirs: str, at_least: float | None = None
+    measured: Mapping[str, Measurement],
+    ours: str,
+    theirs: str,
+    at_least: float | None = None,
+    at_most: float | None = None,
 ) -> Comparison:
     """Return the median over the rounds of the ratio of speeds: slowdowns of the machine affect both."""
     bar = None if at_least is None else Bar(at_least, at_least=True)
+    bar = bar if at_most is None else Bar(at_most, at_least=False)
     name = f"{ours}, beside {theirs}"
     if theirs not in measured:
         return Comparison(name, None, "x", bar, ours, theirs)
@@ -340,6 +353,7 @@ BENCHMARKS: Mapping[str, str] = {
     "call": "pose and Jacobian of one frame at one configuration",
     "frames": "the poses of all frames at one configuration",
     "batch": "pose and Jacobian at 100 000 configurations",
+    "learning": "pose and Jacobian at 4096 configurations in JAX and PyTorch, beside jaxadi",
     "loop": "a closed loop and its derivative at one configuration",
     "motion": "coordinates after a step, and constraints: a robot in a kitchen, as a control loop asks",
     "geometry": "what is near, and how near: an arm among boxes, a robot in a kitchen",
@@ -409,7 +423,7 @@ def run_benchmarks(
         yield result
 
 
-VERSIONS = "casadi numpy pin mujoco coal pybullet daqp pin-pink mink qpsolvers ompl".split()  # noqa: SIM905
+VERSIONS = "casadi numpy pin mujoco coal pybullet daqp pin-pink mink qpsolvers ompl jax jaxadi torch".split()  # noqa: SIM905
 
 
 @dataclass(frozen=True, slots=True)

@@ -35,6 +35,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--quick", action=flag, help="reduced experiment, in seconds")
     add("--data", metavar="FOLDER", type=Path, help="folder of the recordings that it needs")
     add("--model", metavar="MODEL", help="name or path of its model")
+    folders = "folder of further models; may be given several times"
+    add("--models", metavar="FOLDER", action="append", type=Path, default=[], help=folders)
     add("--seed", metavar="N", type=int, default=0, help="first seed (0)")
     add("--count", metavar="N", type=int, help="number of seeds or repetitions")
     robots = "name or path of a robot; may be given several times"
@@ -63,10 +65,11 @@ def run(arguments: argparse.Namespace) -> int:
         return 0
     if arguments.name is None:
         raise UnknownNameError(f"Name an experiment. There are: {', '.join(EXPERIMENTS)}.")
-    given = vars(arguments) | {"robot": tuple(arguments.robot)}
+    given = vars(arguments) | {"robot": tuple(arguments.robot), "models": tuple(arguments.models)}
     options = Options(**{f.name: given[f.name] for f in fields(Options) if f.name in given})
     needed = REQUIRED_EXTRAS.get(arguments.name, ())
     extras = {
+        "check": "check" in needed,
         "control": "control" in needed,
         "exchange": "exchange" in needed,
         "figures": arguments.figure is not None,

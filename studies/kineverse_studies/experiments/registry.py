@@ -21,6 +21,7 @@ class Options:
     quick: bool = False  # true for a reduced experiment, in seconds
     data: Path | None = None  # folder of recordings or robots
     model: str | None = None  # name or path of the model; None for the default
+    models: tuple[Path, ...] = ()  # folders of further models
     seed: int = 0  # first seed
     count: int | None = None  # number of seeds, repetitions or the like; None for the default
     robot: tuple[str, ...] = ()  # names or paths of robots; empty for the default
@@ -58,15 +59,20 @@ EXPERIMENTS: Mapping[str, str] = {
     "kitchens": "generated kitchens, of which robots open and close all (--seed N --count 50)",
     "table1-open": "grasped objects are opened, also by the papers' two programs (2022 paper, Table I)",
     "table1-push": "twelve objects of a kitchen are pushed shut (both papers, Table I)",
+    "checks": "what the motion checks find in models broken on purpose (--seed N --count 20 --models FOLDER)",
     "unknown-objects": "a door and a drawer whose joints nobody described are opened (--count 10)",
     "lockbox": "parts that lock each other, opened by trends and by plans (thesis behind the 2020 paper)",
     "live": "three objects opened and closed by processes in real time, and kitchens (2022 paper, IV-D)",
     "ablations": "pushes and locks without augmented gradients, and with each rule of trends",
+    "calibration": "joints, cameras and wheels calibrated, against the Cramér-Rao bound and OpenCV",
     "estimation-grid": "hinges and sliders learned from noisy poses, against the Cramér-Rao bound",
+    "conversion": "models written as URDF, MJCF and SDF, compared with pinocchio, MuJoCo and drake",
 }
 """Descriptions of experiments by name; the names are modules of this package, with dashes for underscores."""
 REQUIRED_EXTRAS: Mapping[str, tuple[str, ...]] = {  # extras without which an experiment cannot run
+    "conversion": ("check",),
     "ablations": ("control", "geometry"),
+    "checks": ("geometry",),
     "kitchens": ("control", "geometry"),
     "live": ("control", "geometry", "mjcf", "exchange"),
     "lockbox": ("control",),

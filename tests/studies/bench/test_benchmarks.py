@@ -32,7 +32,16 @@ SHORT = ("call", "frames", "batch", "edit", "examples")
 
 
 # Some of their rows are about robots, kitchens and examples that the minimal settings leave out.
-PARTS = ("geometry", "inverse_kinematics", "examples", "document", "edit", "motion", "identification")
+PARTS = (
+    "geometry",
+    "inverse_kinematics",
+    "examples",
+    "document",
+    "edit",
+    "motion",
+    "identification",
+    "learning",
+)
 
 
 def rows_of_markdown(text):
@@ -99,11 +108,13 @@ def test_a_benchmark_measures_all_installed_peers_and_its_rows_are_documented(na
         others |= {"examples": "mink", "inverse_kinematics": "pink"}
         others["motion"] = "model.integrate"  # states beside vectors; nobody else has these constraints
         others["exchange"] = "relay"
+        others["learning"] = "jaxadi"
         peer = others.get(name, "pinocchio")
         assert any(peer in n or "pin" in n.split() for n in names)
-        # There is no wheel of Bullet for every Python, and ripl-articulation is in no extra of ours.
+        # There is no wheel of Bullet for every Python, torch takes gigabytes, and ripl-articulation is in no
+        # extra of ours.
         assert all(c.value is not None for c in result.comparisons if "bullet" not in c.name)
-        assert [line for line in result.missing if not line.startswith(("pybullet", "ripl_"))] == []
+        assert [line for line in result.missing if not line.startswith(("pybullet", "ripl_", "torch"))] == []
 
 
 @pytest.mark.parametrize("name", ["call", "frames", BATCH, "edit"])

@@ -172,24 +172,12 @@ class Calibration:
     ) -> SaveResult:
         """Write the corrected model to a file, in the format of its ending.
 
-        A URDF is the file that the model was loaded from, with other numbers for corrected origins and axes;
-        all its other bytes are as they were. The remarks say what it has no number for, such as the radius of
-        a wheel. A document (``.kv.json``) holds all corrections. Other files are written as by
-        :meth:`.Model.save`.
+        A URDF is the file that the model was loaded from, or ``source``, with other numbers for corrected
+        origins and axes; all its other bytes are as they were. The remarks say what it has no number for,
+        such as the radius of a wheel. A document (``.kv.json``) holds all corrections.
 
-        Parameters
-        ----------
-        path
-            File to write.
-        source
-            URDF that the model was made of, if it is not known or one of several.
-
-        Raises
-        ------
-        FormatError
-            If the URDF is a template of xacro, has changed since it was loaded, or is not that of the model.
-        InvalidValueError
-            If the model has been edited since the calibration at what is corrected.
+        A URDF that is a template of xacro, has changed since it was loaded, or is not that of the model is
+        refused, and so is a model that was edited since at what is corrected.
         """
         corrected = self.model.copy()
         self.apply(corrected)
@@ -208,11 +196,11 @@ class Calibration:
             deviation = self.deviations[name]
             lines.append(f"  {name:<{width}}  {_format(value, deviation, self.units[name])}")
         for group, size in self.noise.items():
-            parts = [f"noise {_format_size(size, group)}"]
+            parts = [f"noise {format_size(size, group)}"]
             if group in self.before:
-                parts.append(f"off by {_format_size(self.before[group], group)} before")
+                parts.append(f"off by {format_size(self.before[group], group)} before")
             if group in self.held_out:
-                parts.append(f"a look not used is off by {_format_size(self.held_out[group], group)}")
+                parts.append(f"a look not used is off by {format_size(self.held_out[group], group)}")
             lines.append(f"{group}: {', '.join(parts)}")
         if self.outliers:
             looks = sorted({outlier.look for outlier in self.outliers})
@@ -229,20 +217,21 @@ def format_direction(direction: Mapping[str, float]) -> str:
     return ", ".join(f"{name} {value:.2f}" for name, value in largest if abs(value) >= _SHOWN)
 
 
-_UNITS = {"m": (1e3, "mm"), "rad": (180 / math.pi, "deg")}
+SHOWN_UNITS = {"m": (1e3, "mm"), "rad": (180 / math.pi, "deg")}
 _GROUP_UNITS = {"position": "m", "point": "m", "orientation": "rad", "pixel": "px"}
 
 
 def _format(value: float, deviation: float, unit: str) -> str:
-    factor, shown = _UNITS.get(unit, (1.0, unit))
+    factor, shown = SHOWN_UNITS.get(unit, (1.0, unit))
     if math.isinf(deviation):
         return f"{factor * value:+.4g} {shown}".rstrip() + ", not told"
     return f"{factor * value:+.4g} ± {factor * deviation:.2g} {shown}".rstrip()
 
 
-def _format_size(size: float, group: str) -> str:
+def format_size(size: float, group: str) -> str:
+    """Return the size of a noise or an error of a group with its unit."""
     unit = _GROUP_UNITS.get(group, "")
-    factor, shown = _UNITS.get(unit, (1.0, unit))
+    factor, shown = SHOWN_UNITS.get(unit, (1.0, unit))
     return f"{factor * size:.3g} {shown}".rstrip()
 
 
@@ -473,7 +462,7 @@ def _check_explained(problem: CalibrationProblem, fit: CalibrationFit) -> None:
     correction for few data where the size of the noise is estimated (McQuarrie, 1999).
     """
     count, inliers = sum(map(len, fit.weights)), sum(float(w.sum()) for w in fit.weights)
-    sizes = ", ".join(_format_size(size, name) for name, size in fit.noise.items())
+    sizes = ", ".join(format_size(size, name) for name, size in fit.noise.items())
     if inliers < count / 2:
         raise InvalidValueError(
             f"The recordings do not fit the model: only {inliers:.0f} of {count} observations agree with it"

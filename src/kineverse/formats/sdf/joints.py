@@ -18,6 +18,7 @@ from kineverse.errors import suggest
 from kineverse.formats.description import DisjointSets
 from kineverse.formats.mimic import MimicRelation, is_valid_factor
 from kineverse.formats.poses import compose_poses, invert_pose, rotate_direction
+from kineverse.formats.reader_warnings import CrossedLimits
 from kineverse.formats.xml_reader import Element, ElementError, find_child, quote
 from kineverse.formats.xml_values import (
     read_axis_direction,
@@ -160,7 +161,8 @@ def _axis(node: PoseNode, tag: str, suffix: str, kind: SdfJointType) -> SdfAxis:
         mistake = ElementError(
             limit, f"has lower {lower!r} above upper {upper!r}: no position would be valid."
         )
-        remarks.repair(mistake, "the joint is not limited", element)
+        crossed = partial(CrossedLimits.of, f"{node.path}{suffix}")
+        remarks.repair(mistake, "the joint is not limited", element, crossed)
         lower = upper = None
     zero = _first_zero(node, kind)
     lower, upper = (None if bound is None else bound + zero for bound in (lower, upper))

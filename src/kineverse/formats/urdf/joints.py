@@ -9,13 +9,14 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
+from functools import partial
 
 from msgspec.structs import replace
 
 from kineverse.errors import FormatError, suggest
 from kineverse.formats.mimic import MimicRelation, resolve_mimic_chains
-from kineverse.formats.reader_warnings import ChangedMotion, Fault, ReaderWarnings
+from kineverse.formats.reader_warnings import ChangedMotion, CrossedLimits, Fault, ReaderWarnings
 from kineverse.formats.xml_reader import Element, ElementError, abbreviate, quote, read_name
 from kineverse.formats.xml_values import (
     LARGEST,
@@ -249,7 +250,9 @@ def _range(
     if math.isnan(lower) or math.isnan(upper):
         return None, None
     invalid: ElementError | None = None
+    kind: Callable[[str], Fault] = Fault
     if lower > upper:
+        kind = partial(CrossedLimits.of, joint[1].get("name", ""))
         invalid = ElementError(
             limit, f"has lower={lower!r} above upper={upper!r}: no position would be valid."
         )
@@ -258,7 +261,7 @@ def _range(
             limit, f"has lower={lower!r} and upper={upper!r}: all positions would be beyond {LARGEST:g}."
         )
     if invalid is not None:
-        remarks.repair(invalid, "the joint is not limited", joint)
+        remarks.repair(invalid, "the joint is not limited", joint, kind)
         return None, None
     return (lower if lower > -math.inf else None), (upper if upper < math.inf else None)
 

@@ -58,9 +58,9 @@ class KeptParts(_Record, frozen=True, tag=DATUM):
     """Parts of one URDF that its model does not say.
 
     ``robot`` is the name of the robot, and ``anchor`` the link that the datum is named for. ``visuals`` has
-    for each link the name of the material of each visual, and whether it is defined there. ``names`` are
-    those of all links and joints in the file, which elements may name, and ``renamed`` are those that have
-    another name in the model.
+    for each link the name of the material of each visual, and whether it is defined there. ``names`` are the
+    links and joints of the file that occur in elements, and ``renamed`` those that have another name in the
+    model.
     """
 
     robot: str
@@ -105,6 +105,7 @@ _TOKEN = re.compile(
 _ATTRIBUTE = re.compile(r"([^\s=/]+)\s*=\s*(?:\"([^\"]*)\"|'([^']*)')")
 _REFERRING = re.compile("joint|link|frame|body|parent|child|reference|mimic", re.IGNORECASE)
 _TEXT = re.compile(r"[^<]*")
+_WORDS = re.compile(r"(?<=[\"'>])[^\"'<>]+")
 
 
 def find_elements(text: str, owners: Container[tuple[str, str]], skipped: str) -> Iterator[KeptElement]:
@@ -148,6 +149,14 @@ def _end_of(text: str, token: re.Match[str]) -> int:
             if not depth:
                 return later.end()
     return len(text)
+
+
+def find_occurring(elements: Iterable[KeptElement], names: Iterable[str]) -> tuple[str, ...]:
+    """Return the names that are values of attributes or texts in some element."""
+    words: set[str] = set()
+    for element in elements:
+        words.update(map(_plain, _WORDS.findall(element.text)))
+    return tuple(name for name in names if name in words)
 
 
 def find_references(text: str) -> Iterator[tuple[int, int, str]]:

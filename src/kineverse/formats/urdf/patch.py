@@ -1,7 +1,7 @@
 """Corrected origins and axes of joints, written into the text of their URDF.
 
-Only the numbers that changed are replaced. All other bytes stay, and with them the transmissions, plugins,
-materials and comments that a model does not have.
+Only the numbers that changed are replaced. All other bytes stay, and with them comments, order, line ends and
+all that a model does not have.
 """
 
 from __future__ import annotations
@@ -196,6 +196,7 @@ def _difference_of_axes(a: Joint, b: Joint) -> float:
 
 def _check_origin(file: FileContent, tag: str, before: Operation | None, original: Joint) -> None:
     """Check that a joint of the model is where its file has it."""
+    before = before and (before.rebuild() or before)  # an operation of a document
     if not isinstance(before, Joint):
         raise FormatError(f"{file.path.name} is another file: the model lacks its joint '{original.name}'.")
     off = float(np.abs(_origin(before) - _origin(original)).max())

@@ -25,7 +25,7 @@ from kineverse.model.frame import WORLD
 from .bodies import UrdfLinkReader
 from .description import UrdfJoint, UrdfLink, UrdfRobot
 from .joints import read_urdf_joint, resolve_mimic_joints
-from .kept_elements import KeptElement, KeptParts, find_elements, has_unknown_parts
+from .kept_elements import KeptElement, KeptParts, find_elements, find_occurring, has_unknown_parts
 
 _VERSIONS = {"1.0": (1, 0), "1.1": (1, 1), "1.2": (1, 2)}
 _EXTENSIONS = frozenset(("gazebo", "transmission"))
@@ -152,7 +152,7 @@ class _Document:
                 self.remarks.add(top, "is in no encoding whose extensions can be kept; they are left out.")
             else:
                 elements = tuple(find_elements(plain, self._owners, self._xacro))
-        names = tuple(dict.fromkeys((*self.links, *self.joints))) if elements else ()
+        names = find_occurring(elements, dict.fromkeys((*self.links, *self.joints))) if elements else ()
         kept = KeptParts(top[1].get("name", ""), "", namespaces, tuple(self._reader.materials.defined))
         return structs.replace(kept, visuals=tuple(visuals), elements=elements, names=names)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import math
 from typing import Any
 
 import numpy as np
@@ -24,7 +24,7 @@ from kineverse.model.body import (
     Sphere,
 )
 
-from .pxr_api import NAME, number_of, pose_from_gf, pxr, text_of
+from .pxr_api import NAME, number_of, numbers_of, pose_from_gf, pxr, text_of
 from .scene import IN_WORLD, UsdBody, UsdScene, find_body_above
 
 _EQUAL = 1e-6  # relative difference of two scales that are one: stages have six digits of them
@@ -45,7 +45,7 @@ class UsdBodyReader:
         self._shapes: dict[str, list[tuple[Any, str]]] = {}
         self.remarks: list[str] = []
         self._meshes = 0
-        for prim in scene.stage.Traverse():
+        for prim in scene.stage.Traverse(pxr().Usd.TraverseInstanceProxies()):
             if prim.IsA(pxr().UsdGeom.Gprim):
                 self._shapes.setdefault(find_body_above(prim, scene.bodies), []).append(
                     (prim, str(prim.GetPath()))
@@ -95,13 +95,11 @@ class UsdBodyReader:
         if np.abs(turn.T @ turn - np.eye(3)).max() > _EQUAL:
             self._say(path, "is sheared, as no shape of a model is")
             return None
-        if np.linalg.det(turn) < 0:
-            turn = turn * np.array(
-                [1.0, 1.0, -1.0]
-            )  # all of these shapes are their own mirror images but cones
         geometry, axis = self._geometry(prim, path, scale * units.length)
         if geometry is None:
             return None
+        if np.linalg.det(turn) < 0:  # shapes are their own mirror images across their axis
+            turn[:, 1 if axis == "X" else 0] *= -1.0
         world_T_shape = transform(turn @ _AXES[axis], units.rotation @ rows[:3, 3] * units.length)
         origin = round_exact(inverse(world_T_body) @ world_T_shape)
         return Shape(geometry, Pose.from_matrix(origin), text_of(prim, NAME) or "", _color(prim))
@@ -111,27 +109,33 @@ class UsdBodyReader:
         kind, axis = str(prim.GetTypeName()), "Z"
 
         def number(name: str) -> float:
-            return float(prim.GetAttribute(name).Get())
+            value = prim.GetAttribute(name).Get()
+            return float(value) if isinstance(value, (int, float)) else math.nan
 
+        form: Geometry
         if kind == "Cube":
-            x, y, z = (number("size") * scale).tolist()
-            return Box((x, y, z)), axis
-        if kind == "Sphere":
-            a, b, c = (number("radius") * scale).tolist()
-            return Sphere(a) if _same(a, b, c) else Ellipsoid((a, b, c)), axis
-        if kind not in ("Cylinder", "Capsule", "Cone"):
+            x, y, z = sizes = (number("size") * scale).tolist()
+            form = Box((x, y, z))
+        elif kind == "Sphere":
+            a, b, c = sizes = (number("radius") * scale).tolist()
+            form = Sphere(a) if _same(a, b, c) else Ellipsoid((a, b, c))
+        elif kind in ("Cylinder", "Capsule", "Cone"):
+            given = str(prim.GetAttribute("axis").Get())
+            axis = given if given in _AXES else axis
+            along = "XYZ".index(axis)
+            across = [float(scale[k]) for k in range(3) if k != along]
+            if not _same(*across) or (kind == "Capsule" and not _same(*scale.tolist())):
+                self._say(path, f"is a {kind.lower()} that is scaled to none")
+                return None, axis
+            sizes = [number("radius") * across[0], number("height") * float(scale[along])]
+            form = {"Cylinder": Cylinder, "Capsule": Capsule, "Cone": Cone}[kind](*sizes)  # type: ignore[assignment]
+        else:
             self._say(path, f"is a {quote(kind)}, which no model has")
             return None, axis
-        axis = str(prim.GetAttribute("axis").Get())
-        along = "XYZ".index(axis)
-        across = [float(scale[k]) for k in range(3) if k != along]
-        if not _same(*across) or (kind == "Capsule" and not _same(*scale.tolist())):
-            self._say(path, f"is a {kind.lower()} that is scaled to none")
+        if not all(0 <= size < math.inf for size in sizes):
+            self._say(path, "has a size that is none")
             return None, axis
-        radius, length = number("radius") * across[0], number("height") * float(scale[along])
-        if kind == "Cone":
-            return Cone(radius, length), axis
-        return (Cylinder if kind == "Cylinder" else Capsule)(radius, length), axis
+        return form, axis
 
     def _inertia(self, body: UsdBody) -> Inertia | None:
         prim = self._scene.stage.GetPrimAtPath(body.path)
@@ -140,17 +144,14 @@ class UsdBodyReader:
         if not mass > 0:
             return None
         rows = np.array(self._xforms.GetLocalToWorldTransform(prim)).T
-        centre, axes = prim.GetAttribute("physics:centerOfMass"), prim.GetAttribute("physics:principalAxes")
-        point = np.array(tuple(centre.Get())) if centre and centre.HasAuthoredValue() else np.zeros(3)
-        if not np.isfinite(point).all():
-            point = np.zeros(3)
+        point = np.array(numbers_of(prim, "physics:centerOfMass", 3) or (0.0, 0.0, 0.0))
         world = units.rotation @ (rows @ np.append(point, 1.0))[:3] * units.length
         place = (inverse(body.pose) @ np.append(world, 1.0))[:3]
+        axes = prim.GetAttribute("physics:principalAxes").Get()
         turn = np.eye(3)
-        if axes and axes.HasAuthoredValue():
-            turn = pose_from_gf((0.0, 0.0, 0.0), axes.Get())[:3, :3]
-        moments = prim.GetAttribute("physics:diagonalInertia")
-        diagonal = np.array(tuple(moments.Get())) if moments and moments.HasAuthoredValue() else np.zeros(3)
+        if isinstance(axes, pxr().Gf.Quatf):
+            turn = pose_from_gf((0.0, 0.0, 0.0), axes)[:3, :3]
+        diagonal = np.array(numbers_of(prim, "physics:diagonalInertia", 3) or (0.0, 0.0, 0.0))
         xx, yy, zz = (diagonal * units.mass * units.length**2).tolist()
         if not any((xx, yy, zz)):
             self._say(body.path, "has a mass and no moments of inertia, which are 0 here")
@@ -167,12 +168,9 @@ def _same(*numbers: float) -> bool:
 
 
 def _color(prim: Any) -> tuple[float, float, float, float] | None:
-    def first(name: str) -> Iterator[Any]:
-        found = prim.GetAttribute(name)
-        value = found.Get() if found and found.HasAuthoredValue() else None
-        yield from list(value[:1]) if value else ()
-
-    for r, g, b in first("primvars:displayColor"):
-        alpha = next(iter(first("primvars:displayOpacity")), 1.0)
-        return float(r), float(g), float(b), float(alpha)
-    return None
+    """Return the first colour of a shape, with its opacity."""
+    rgb = numbers_of(prim, "primvars:displayColor", 3)
+    if not rgb:
+        return None
+    (alpha,) = numbers_of(prim, "primvars:displayOpacity", 1) or (1.0,)
+    return rgb[0], rgb[1], rgb[2], alpha

@@ -20,11 +20,13 @@ from kineverse.formats.description import DisjointSets, Matrix
 from kineverse.formats.engines import PoseEngine
 from kineverse.formats.xml_reader import quote
 from kineverse.lie import (
-    axis_angle,
     inverse,
     log_so3,
     quaternion,
     rotation_angle,
+    rotation_x,
+    rotation_y,
+    rotation_z,
     to_quaternion,
     transform,
     translation,
@@ -34,7 +36,7 @@ from kineverse.model.registry import FrameDeviation
 from .pxr_api import ROTATIONS, TRANSLATIONS, open_stage, pxr
 from .scene import IN_WORLD, UsdBody, UsdJoint, UsdScene, read_scene
 
-_UNIT = np.eye(3)
+_TURNS = (rotation_x, rotation_y, rotation_z)
 _FREE = ("x", "y", "z", "qx", "qy", "qz", "qw")
 
 
@@ -127,7 +129,7 @@ class UsdEngine(PoseEngine):
     Kinematic bodies, which no joint moves, and what they carry have no poses here.
     """
 
-    package, distribution = "pxr", "usd-core"
+    name, package, distribution = "usd-core", "pxr", "usd-core"
     equal = 1e-6  # joints are in single precision
 
     def __init__(self, path: Path) -> None:
@@ -137,6 +139,9 @@ class UsdEngine(PoseEngine):
         still = self._tree.still
         self.frames = [body.name for place, body in scene.bodies.items() if place not in still]
         self.frames += [frame.name for frame in scene.frames if frame.body not in still]
+        self.skipped = {body.name for place, body in scene.bodies.items() if place in still}
+        self.skipped |= {frame.name for frame in scene.frames if frame.body in still}
+        self.remarks = ["usd-core reads the file, and has no kinematics: these are of Kineverse"]
         self.remarks += [
             f"no joint of the file moves '{scene.bodies[place].name}': it is not compared" for place in still
         ]
@@ -246,9 +251,9 @@ def _motion(joint: UsdJoint, values: Mapping[str, float], by_path: Mapping[str, 
             continue
         amount = _position(joint, freedom.name, values, by_path)
         if freedom.kind in TRANSLATIONS:
-            offset = offset + amount * _UNIT[TRANSLATIONS.index(freedom.kind)]
+            offset = offset + amount * np.eye(3)[TRANSLATIONS.index(freedom.kind)]
         else:
-            turn = axis_angle(_UNIT[ROTATIONS.index(freedom.kind)], np.array(amount))
+            turn = _TURNS[ROTATIONS.index(freedom.kind)](np.array(amount))
     result: Matrix = translation(offset) @ transform(turn, np.zeros(3))
     return result
 

@@ -38,7 +38,7 @@ from kineverse.model.registry import FileContent
 from .bodies import UsdBodyReader
 from .embedded_document import find_embedded_document
 from .kinematics import positions_on_stage
-from .pxr_api import ROTATIONS, TRANSLATIONS, open_stage
+from .pxr_api import ROTATIONS, TRANSLATIONS, open_stage, refuse_errors
 from .scene import IN_WORLD, UsdFreedom, UsdJoint, UsdScene, read_scene
 
 _STILL = 1e-6  # position [rad], [m] on a stage that is 0 in single precision
@@ -50,7 +50,8 @@ def usd_file_operations(file: FileContent) -> Iterator[tuple[str, Operation] | H
     A document of a stage that has changed since is passed over with a warning, and refused if ``strict``.
     """
     stage = open_stage(file.path)
-    document = find_embedded_document(stage)
+    with refuse_errors(file.path.name):
+        document = find_embedded_document(stage)
     if document is not None and document.is_current:
         source = f"{file.path}, its document"
         yield from entries_from_bytes(
@@ -77,9 +78,10 @@ def _scene_operations(scene: UsdScene, file: FileContent) -> Iterator[tuple[str,
             f"{source} has nothing that moves: {_count_prims(scene)}, and no rigid body. Kineverse reads "
             "stages of UsdPhysics, with rigid bodies and joints between them."
         )
-    reader = UsdBodyReader(scene, source)
-    bodies = {path: reader.read(body) for path, body in scene.bodies.items()}
-    world = reader.read(None)
+    with refuse_errors(source):
+        reader = UsdBodyReader(scene, source)
+        bodies = {path: reader.read(body) for path, body in scene.bodies.items()}
+        world = reader.read(None)
     warn([*scene.remarks, *reader.finish()])
     if not is_empty_body(world):
         yield f"body {WORLD}", SetBody(WORLD, world)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -16,6 +17,7 @@ import numpy as np
 from kineverse._extras import install_command
 from kineverse.errors import FormatError, MissingDependencyError, list_some
 from kineverse.formats.description import Matrix
+from kineverse.formats.isolation import IsolatedCallError, call_isolated
 from kineverse.formats.poses import unit_quaternion
 from kineverse.lie import quaternion, transform
 
@@ -45,6 +47,7 @@ TRANSLATIONS, ROTATIONS = ("transX", "transY", "transZ"), ("rotX", "rotY", "rotZ
 
 LARGEST_FLOAT = float(np.finfo(np.float32).max)  # bounds beyond it are none: USD has them in single precision
 
+_BINARY = b"PXR-USDC"  # start of a binary file
 _LONGEST_REASON = 300  # characters of an error of OpenUSD that are shown: it quotes the file
 _REASON = re.compile(r"Error in '[^']*' at line \d+ in file \S+ : '(.*?)'\s*(?=Error in '|$)", re.DOTALL)
 
@@ -77,33 +80,75 @@ def capture_diagnostics() -> Iterator[list[str]]:
 def open_stage(path: Path) -> Any:
     """Open the stage of one file, as it is on disk now; refuse a file that is composed of further ones."""
     api = pxr()
-    try:
-        # A layer that is opened by its path may be an older one, which somebody in the process still holds.
-        layer = api.Sdf.Layer.OpenAsAnonymous(str(path))
-    except api.Tf.ErrorException as error:
-        raise FormatError(f"{path} is no USD that can be read: {_reason(error)}.") from None
-    if layer is None:
-        raise FormatError(f"{path} is no USD that can be read: its content is that of no USD file.")
-    others = [name for name in layer.GetCompositionAssetDependencies() if name]
+    with capture_diagnostics():
+        try:
+            layer = _open_layer(path)
+            others = [name for name in layer.GetCompositionAssetDependencies() if name]
+            stage = None if others else api.Usd.Stage.Open(layer)
+        except api.Tf.ErrorException as error:
+            raise _unreadable(path, _reason(error, path)) from None
     if others:
         raise FormatError(
             f"{path} is composed of further files, {list_some(others, 3)}, which are not opened. Write all "
             f"into one file first: usdcat --flatten {path.name} -o flat.usda"
         )
-    try:
-        stage = api.Usd.Stage.Open(layer)
-    except api.Tf.ErrorException as error:
-        raise FormatError(f"{path} is no USD that can be read: {_reason(error)}.") from None
-    if stage is None:
-        raise FormatError(f"{path} is no USD that can be read: it has no stage.")
     return stage
 
 
-def _reason(error: Exception) -> str:
-    """Return the reason in an error of OpenUSD, without the places in its sources, on one line."""
-    text = str(error).strip()
+def _open_layer(path: Path) -> Any:
+    """Open the layer of a file; a binary one as the text that a process of its own makes of it.
+
+    One wrong byte in a binary file may have OpenUSD loop for ever, or crash.
+    """
+    layers = pxr().Sdf.Layer
+    with path.open("rb") as file:
+        is_binary = file.read(len(_BINARY)) == _BINARY
+    if not is_binary:
+        # A layer that is opened by its path may be an older one, which somebody in the process still holds.
+        layer = layers.OpenAsAnonymous(str(path))
+        if layer is None:
+            raise _unreadable(path, "its content is that of no USD file")
+        return layer
+    try:
+        text, reason = call_isolated(__name__, "export_layer", str(path.absolute()))
+    except IsolatedCallError as error:
+        raise _unreadable(path, str(error)) from None
+    if reason:
+        raise _unreadable(path, reason)
+    layer = layers.CreateAnonymous(".usda")
+    layer.ImportFromString(text)
+    return layer
+
+
+def export_layer(path: str) -> tuple[str, str]:
+    """Return the text of a binary layer, or the reason why it cannot be read."""
+    api = pxr()
+    try:
+        layer = api.Sdf.Layer.OpenAsAnonymous(path)
+        return ("", "its content is damaged") if layer is None else (layer.ExportToString(), "")
+    except api.Tf.ErrorException as error:
+        return "", _reason(error, Path(path))
+
+
+def _unreadable(path: Path, reason: str) -> FormatError:
+    return FormatError(f"{path} is no USD that can be read: {reason}.")
+
+
+@contextmanager
+def refuse_errors(source: str) -> Iterator[None]:
+    """Turn the errors of OpenUSD, as about values of a wrong type, into one of the file."""
+    try:
+        yield
+    except pxr().Tf.ErrorException as error:
+        raise FormatError(f"{source} is no USD that can be read: {_reason(error, Path(source))}.") from None
+
+
+def _reason(error: Exception, path: Path) -> str:
+    """Return the reason in an error of OpenUSD on one line, without the file and places in its sources."""
+    text, file = str(error).strip(), os.path.abspath(path)
     found = _REASON.search(text)
-    return " ".join((found[1] if found else text).split()).removesuffix(".")[:_LONGEST_REASON]
+    reason = (found[1] if found else text).replace(f"<{file}>", "it").replace(f"{file}:", "line ")
+    return " ".join(reason.split()).removesuffix(".")[:_LONGEST_REASON]
 
 
 def to_gf_matrix(pose: Matrix) -> Any:
@@ -136,6 +181,17 @@ def text_of(prim: Any, attribute: str) -> str | None:
     """Return the text of a custom attribute; None if the prim has none."""
     value = prim.GetAttribute(attribute).Get() if prim.HasAttribute(attribute) else None
     return value if isinstance(value, str) and value else None
+
+
+def numbers_of(prim: Any, attribute: str, count: int) -> tuple[float, ...]:
+    """Return the first numbers of an attribute that is authored; none if there are fewer finite ones."""
+    found = prim.GetAttribute(attribute)
+    value = found.Get() if found and found.HasAuthoredValue() else None
+    try:
+        numbers = tuple(np.ravel(np.array(value, dtype=float))[:count].tolist()) if value is not None else ()
+    except (TypeError, ValueError):
+        return ()
+    return numbers if len(numbers) == count and np.isfinite(numbers).all() else ()
 
 
 def number_of(prim: Any, attribute: str) -> float | None:

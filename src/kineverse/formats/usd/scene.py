@@ -35,8 +35,10 @@ from .pxr_api import (
     TRANSLATIONS,
     capture_diagnostics,
     number_of,
+    numbers_of,
     pose_from_gf,
     pxr,
+    refuse_errors,
     text_of,
 )
 
@@ -127,8 +129,8 @@ def read_scene(stage: Any, source: str) -> UsdScene:
     """Return the bodies and joints of a stage; errors name the source and the prim."""
     api = pxr()
     units = _read_units(stage, source)
-    with capture_diagnostics():
-        # Versions before 26.05 have the old name alone.
+    with capture_diagnostics(), refuse_errors(source):
+        # Older versions have the second name alone.
         parse = (
             getattr(api.UsdPhysics, "UsdPhysicsLoadStageFromPrimRange", None)
             or api.UsdPhysics.LoadUsdPhysicsFromRange
@@ -136,7 +138,7 @@ def read_scene(stage: Any, source: str) -> UsdScene:
         parsed = {
             str(kind).rpartition(".")[2]: list(descs) for kind, (_, descs) in parse(stage, ["/"]).items()
         }
-    return _SceneReader(stage, source, units).read(parsed)
+        return _SceneReader(stage, source, units).read(parsed)
 
 
 def _read_units(stage: Any, source: str) -> UsdUnits:
@@ -222,17 +224,8 @@ class _SceneReader:
             found.kinematicBody,
             bool(massless and massless.Get()),
             text_of(prim, FREE) or "",
-            self._numbers(prim, HOME, 7),
+            numbers_of(prim, HOME, 7),
         )
-
-    def _numbers(self, prim: Any, attribute: str, count: int) -> tuple[float, ...]:
-        """Return the numbers of a custom attribute; none if there are not as many."""
-        value = prim.GetAttribute(attribute).Get() if prim.HasAttribute(attribute) else None
-        try:
-            numbers = tuple(map(float, value)) if value is not None else ()
-        except (TypeError, ValueError):
-            return ()
-        return numbers if len(numbers) == count and np.isfinite(numbers).all() else ()
 
     def _frames(self, bodies: dict[str, UsdBody]) -> Iterator[UsdFrame]:
         for prim in self._stage.Traverse():
@@ -394,7 +387,7 @@ class _SceneReader:
     def _mimic(self, prim: Any, unit: float) -> MimicRelation[str] | None:
         own = prim.GetRelationship(LEADER)
         if own and own.GetTargets():
-            offset, factor = self._numbers(prim, COEFFICIENTS, 2) or (0.0, 1.0)
+            offset, factor = numbers_of(prim, COEFFICIENTS, 2) or (0.0, 1.0)
             return MimicRelation(str(own.GetTargets()[0]), factor, offset)
         relation = prim.GetRelationship("newton:mimicJoint")
         leaders = relation.GetTargets() if relation else []

@@ -1,0 +1,1 @@
+"""PartNet-Mobility, the files ``mobility_v2.json`` of articulated objects with their meshes."""
