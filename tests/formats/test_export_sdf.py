@@ -18,8 +18,7 @@ from test_export_urdf import REFUSED
 import kineverse as kv
 from hypothesis_profiles import attempts
 from kineverse.formats.reader_warnings import collect_warnings
-from kineverse.formats.sdf.custom_attributes import NAMESPACE
-from kineverse.formats.sdf.writer import allowed_name
+from kineverse.formats.sdf.custom_attributes import NAMESPACE, allowed_name
 from kineverse.model.basic_operations import SetBody, SetHome, SoftLimits
 from kineverse.model.body import Body, Box, Capsule, Cone, Ellipsoid, Inertia, Mesh, Shape, Sphere
 

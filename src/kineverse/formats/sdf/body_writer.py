@@ -25,7 +25,7 @@ from kineverse.model.body import (
     Sphere,
 )
 
-from .custom_attributes import INERTIA, NAME
+from .custom_attributes import INERTIA, NAME, allowed_name
 
 _TENSOR = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 _ROUNDING = 1e-9  # part of the largest moment by which a sum of two may fall short: files have ten digits
@@ -48,7 +48,7 @@ class SdfBodyWriter:
         names = TakenNames()
         for tag, shapes in (("visual", body.visuals), ("collision", body.collisions)):
             for shape in shapes:
-                own = names.take(*([shape.name] if _is_allowed(shape.name) else []), tag)
+                own = names.take(*([allowed_name(shape.name)] if shape.name else []), tag)
                 element = link.add(tag, name=own)
                 if own != shape.name:
                     element.attributes[NAME] = shape.name
@@ -125,10 +125,6 @@ def add_sdf_pose(element: Tag, pose: Matrix, relative_to: str | None = None) -> 
     numbers = (*pose[:3, 3].tolist(), *rpy_angles(pose))
     if any(numbers) or relative_to:
         element.add_text("pose", numbers, relative_to=relative_to)
-
-
-def _is_allowed(name: str) -> bool:
-    return bool(name) and "::" not in name and not (name.startswith("__") and name.endswith("__"))
 
 
 def _is_physical(inertia: Inertia) -> bool:

@@ -102,3 +102,12 @@ def joint_motion(axis: Vector3, is_rotation: bool, values: Sequence[float], pitc
     slide = q * pitch / math.tau if is_rotation else q
     rotation = axis_angle(np.array(axis), np.array(q)) if is_rotation else np.eye(3)
     return Pose.from_matrix(transform(rotation, np.multiply(axis, slide)))
+
+
+def allowed_name(name: str) -> str:
+    """Return a name that SDF allows: not reserved, without scopes, and without blanks that readers drop."""
+    result = "".join(c if c.isprintable() else "_" for c in name).replace("::", "_")
+    result = " ".join(result.split()) or "_"
+    if result == "world" or (result.startswith("__") and result.endswith("__")):
+        result = result.rstrip("_") + "_"
+    return result

@@ -41,7 +41,18 @@ from kineverse.model.model_view import ModelView
 from kineverse.symbols import parse_symbol_name
 
 from .body_writer import SdfBodyWriter, add_sdf_pose
-from .custom_attributes import FREE, HOME, LOOP, NAME, NAMESPACE, PREFIX, ZERO, SdfLoop, joint_motion
+from .custom_attributes import (
+    FREE,
+    HOME,
+    LOOP,
+    NAME,
+    NAMESPACE,
+    PREFIX,
+    ZERO,
+    SdfLoop,
+    allowed_name,
+    joint_motion,
+)
 
 SDF_CAPABILITIES = FormatCapabilities("SDF", loop_joints=True)
 
@@ -459,13 +470,3 @@ def _motion_in_link(joint: _SdfJoint, zero: Sequence[float]) -> Matrix:
     point = translation(np.array(joint.point))
     motion: Matrix = point @ joint_motion(axis, turns, zero, joint.pitch).matrix @ np.linalg.inv(point)
     return motion
-
-
-def allowed_name(name: str) -> str:
-    """Return a name that SDF allows: not reserved, without scopes, and without blanks at its ends."""
-    result = "".join(c if c.isprintable() else "_" for c in name).replace("::", "_")
-    if result != result.strip() or not result:
-        result = result.strip() or "_"
-    if result == WORLD or (result.startswith("__") and result.endswith("__")):
-        result = f"{result}_"
-    return result
