@@ -61,6 +61,7 @@ notch at 0.8 m: height 0.755 m, level: True
     "19_open_a_door": "pr2 moves 12 joints, ...\nopen by 1.39 rad, ..., none violated",
     "20_plan_a_motion": "8 joints, ... points, ... s\nnothing is nearer than ... mm",
     "21_live_system": "...joint door is revolute\n...the door is open by 1.2 rad...",
+    "24_check_a_model": "door: degrees_for_radians: ...\ndrawer: flipped_axis: ...\nmended: nothing is wrong",
 }
 
 NEEDED = {
@@ -69,6 +70,7 @@ NEEDED = {
     "19_open_a_door": ("daqp",),
     "20_plan_a_motion": ("coal",),
     "21_live_system": ("zenoh", "daqp", "coal"),
+    "24_check_a_model": ("coal",),
 }
 """The modules that examples need beyond the core."""
 
