@@ -136,9 +136,12 @@ def test_what_is_certainly_wrong_is_a_finding(kind, coordinate, changes):
     assert finding.joint == coordinate
 
 
-def moved_hinge(x, y, z):
+NARROW = body(shape(0.01, WIDTH - 0.1, 0.3, at=(-0.012, -WIDTH / 2, 0)))
+
+
+def moved_hinge(x, y, z, door=DOOR):
     """Return the cupboard whose door turns about another line, and is where it was at rest."""
-    model = cupboard()
+    model = cupboard(door=door)
     tag = HINGE.default_tag()
     with model.edit() as edit:
         edit.replace(tag, replace(HINGE, child="line", origin=HINGE.origin @ kv.translation(x, y, z)))
@@ -197,17 +200,16 @@ def test_what_is_worth_a_look_is_a_suspect(kind, changes):
 
 
 def test_a_hinge_in_the_middle_turns_half_of_the_door_into_the_hollow_of_the_cupboard():
-    (suspect,) = check_motion(moved_hinge(0, -WIDTH / 2, 0))["door"].suspects
+    (suspect,) = check_motion(moved_hinge(0, -WIDTH / 2, 0, NARROW))["door"].suspects
     assert (suspect.kind, suspect.against, suspect.unit) == ("into_carrier", "cupboard", "1")
     assert suspect.value == pytest.approx(0.5, abs=0.05)
     assert 0.0 < suspect.state["door"] <= 1.5
 
 
 def test_a_door_that_opens_inwards_without_touching_is_flipped():
-    door = body(shape(0.01, WIDTH - 0.1, 0.3, at=(-0.012, -WIDTH / 2, 0)))
-    (suspect,) = check_motion(cupboard(hinge=replace(HINGE, axis=(0, 0, 1)), door=door))["door"].suspects
+    (suspect,) = check_motion(cupboard(hinge=replace(HINGE, axis=(0, 0, 1)), door=NARROW))["door"].suspects
     assert suspect.kind == "flipped_axis"
-    assert not check_motion(cupboard(door=door)).suspects
+    assert not check_motion(cupboard(door=NARROW)).suspects
 
 
 def test_crossed_limits_are_a_finding_by_a_second_constraint_and_by_the_remarks_of_a_reader(tmp_path):

@@ -34,7 +34,7 @@ SMALL_GAP = (
 GAP, LEAST_GAP = 0.15, 0.01
 """Distance of a part from all others that is a suspect, in sizes of the part, and at least [m]."""
 
-ENTERED, LEAST_ENTERED = 0.02, 3e-3
+ENTERED, LEAST_ENTERED = 0.01, 3e-3
 """Depth that is a suspect if two bodies do not overlap at rest, in sizes of the part, and at least [m].
 
 The edge of a door turns into its frame by a part of its thickness.
@@ -88,7 +88,8 @@ class Sweep:
             return
         exceptions = [rule for rule in parts.scene.rules if not rule.check]
         rules = [_EVERYTHING, *exceptions]
-        self._query = parts.scene.watch(part.solids, self.others, self.reach, rules=rules)
+        moving = part.group.coordinates  # what is carried does not move in the part
+        self._query = parts.scene.watch(part.solids, "*", self.reach, moving=moving, rules=rules)
         self._rests = self._look(parts.default) or {}
 
     def _look(self, state: State) -> dict[tuple[str, str], float] | None:
@@ -99,11 +100,13 @@ class Sweep:
         except NoSolutionError:
             return None
         found = self._query()
-        names, own = scene.bodies, set(self.part.solids)
+        names, own, others = scene.bodies, set(self.part.solids), set(self.others)
         result = {}
         for (i, j), distance in zip(found.body_indices.tolist(), found.distances.tolist(), strict=True):
             a, b = names[i], names[j]
-            result[(a, b) if a in own else (b, a)] = distance
+            pair = (a, b) if a in own else (b, a)
+            if pair[1] in others:  # and not what is carried and moves by the same coordinate
+                result[pair] = distance
         return result
 
     @property
