@@ -1,6 +1,7 @@
 """What a type checker has to say about a user's code: mypy checks it with the package, ``test_typing`` runs it."""
 
 import contextlib
+from collections.abc import Callable
 from typing import Any, assert_type
 
 import numpy as np
@@ -30,6 +31,9 @@ assert_type(one.batch(np.zeros((3, 2))), Numbers)
 assert_type(kv.compile(kv.array([1.0, 2.0]))(), Numbers)
 kept: kv.CompiledFunction = one
 either: kv.CompiledFunction[Any] = two
+for convert in (kv.to_jax, kv.to_torch):
+    with contextlib.suppress(kv.errors.MissingDependencyError):
+        assert_type(convert(a * b, [a, b]), Callable[[Any], Any])
 
 # Whatever has three numbers is an axis, whatever is 4×4 a place.
 kv.Revolute(name="d", parent="world", child="d", axis=[0, 0, 1], origin=np.eye(4))
