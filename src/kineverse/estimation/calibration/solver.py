@@ -354,3 +354,71 @@ def check_residuals(linear: Sequence[Linearised], blocks: Sequence[ResidualBlock
                 f"'{block.label}' has no finite prediction in look {block.looks[wrong[0]]} by the present "
                 "model. A point on the image plane of a camera has no pixel."
             )
+
+
+_CONFUSED = (
+    "Check the names of joints and frames, that lengths are in metres and angles in radians, and that states "
+    "and observations belong together."
+)
+_CERTAIN = math.log(20.0)  # log odds against a wrong refusal
+_LOG_ANY_ORIENTATION = -Outliers(reach=1.0).log_uniform_density  # log volume of all orientations [rad³]
+
+
+def check_explained(problem: CalibrationProblem, fit: CalibrationFit, sizes: str) -> None:
+    """Refuse recordings that the model does not explain, even with its best parameters.
+
+    Three other explanations compete: that all observations are gross errors, that all orientations are, and
+    that the observations of each kind are a constant and noise. The criterion is the Bayesian one, with the
+    correction for few data where the size of the noise is estimated (McQuarrie, 1999). ``sizes`` are those
+    of the noise, in words.
+    """
+    count, inliers = sum(map(len, fit.weights)), sum(float(w.sum()) for w in fit.weights)
+    if inliers < count / 2:
+        raise InvalidValueError(
+            f"The recordings do not fit the model: only {inliers:.0f} of {count} observations agree with it"
+            f"{f' to {sizes}' if sizes else ''}, and more than half have to. {_CONFUSED}"
+        )
+    outliers = problem.outliers or Outliers()
+    over_errors, over_constant = -problem.mixture(fit.linear, fit.noise)[1], 0.0
+    numbers, constants = 0.0, 0
+    turns, over_turns = 0.0, 0.0  # orientations, and their log likelihood ratio to any orientation
+    for i, (block, weights) in enumerate(zip(problem.blocks, fit.weights, strict=True)):
+        residual, constant = fit.linear[i].residual, block.scatter()
+        rows = residual.shape[1]
+        numbers += rows * float(weights.sum())
+        over_errors -= len(weights) * block.log_outlier_density(outliers)
+        deviations = problem.deviations(i, fit.noise) * np.ones(rows)
+        for group in block.groups:
+            part, used = group.rows, float(weights.sum())
+            if group.name == "orientation" and problem.whiten[i] is None:
+                square = float(weights @ np.square(residual[:, part] / deviations[part]).sum(axis=1))
+                log_scale = 1.5 * math.log(math.tau) + float(np.log(deviations[part]).sum())
+                turns += 3 * used
+                over_turns += used * (_LOG_ANY_ORIENTATION - log_scale) - square / 2
+        if constant is None or problem.whiten[i] is not None:
+            over_constant = math.inf
+            continue
+        constants += rows
+        for group in block.groups:
+            mine, other = (
+                float(weights @ np.square(one[:, group.rows]).sum(axis=1)) for one in (residual, constant)
+            )
+            width = residual[:, group.rows].shape[1] * float(weights.sum())
+            least = width * FINEST**2
+            over_constant += width / 2 * math.log(max(other, least) / max(mine, least))
+
+    def penalty(parameters: int) -> float:
+        few = numbers / max(numbers - parameters - 2.0, 1.0) if problem.unknown else 1.0
+        return parameters / 2 * math.log(max(numbers, 2.0)) * few
+
+    share = turns / max(numbers, 1.0)
+    if over_errors < penalty(fit.rank) or (turns and over_turns < share * penalty(fit.rank)):
+        raise InvalidValueError(
+            f"The recordings do not fit the model: with its best parameters it is off by {sizes}, which is "
+            f"no better than gross errors only. {_CONFUSED} With few looks, noise= or more of them help."
+        )
+    if over_constant + _CERTAIN < penalty(fit.rank) - penalty(constants):
+        raise InvalidValueError(
+            f"The recordings do not fit the model: with its best parameters it is off by {sizes}, and a "
+            f"constant for each observed frame explains them as well. Or the joints hardly move. {_CONFUSED}"
+        )
