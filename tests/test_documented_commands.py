@@ -29,6 +29,7 @@ DIFFERENT = (
     "diff examples/door.urdf examples/door_new.urdf",
     "diff examples/door.urdf examples/door_new.urdf --values",
     "validate examples/door_new.urdf",
+    "validate examples/door_new.urdf --motion",
     "validate examples/door.urdf examples/door_new.urdf kitchen",
 )
 """What ends with status 1, as it finds what is to be shown."""

@@ -306,5 +306,5 @@ def test_a_missing_engine_is_told_before_anything_is_written(run, robot, monkeyp
     monkeypatch.setitem(sys.modules, "pydrake.multibody.plant", None)
     status, _, err = run("robot.urdf", "robot.sdf", "--check")
     assert status == 2
-    assert "pydrake, which reads such a file, is not installed: " in err
+    assert "drake, which reads such a file, is not installed: " in err
     assert not os.path.exists("robot.sdf")

@@ -49,7 +49,7 @@ def built(*operations: kv.model.Operation) -> kv.Model:
 @pytest.mark.parametrize(
     "name", [*SHIPPED, *(scene for scene in SCENES if scene.split("/")[1] not in CURVES)]
 )
-@pytest.mark.sampled(9)
+@pytest.mark.sampled(11)
 def test_a_model_that_ships_moves_alike_in_drake_and_when_read_back(name: str, tmp_path: Path) -> None:
     model = load_cached(name)
     again = saved(model, tmp_path)

@@ -10,6 +10,7 @@ import pytest
 import kineverse as kv
 
 ENDINGS = (".kv.json", ".urdf", ".xml", ".mjcf")
+EVERY = (*ENDINGS, ".kv.msgpack", ".sdf", ".usda", ".usdc", ".usd")
 
 
 @pytest.fixture
@@ -20,7 +21,7 @@ def model() -> kv.Model:
     return result
 
 
-@pytest.mark.parametrize("ending", ENDINGS)
+@pytest.mark.parametrize("ending", EVERY)
 def test_every_ending_is_read_back(ending: str, model: kv.Model, tmp_path: Path) -> None:
     report = model.save(tmp_path / f"m{ending}")
     assert report.path == tmp_path / f"m{ending}"
@@ -31,7 +32,7 @@ def test_every_ending_is_read_back(ending: str, model: kv.Model, tmp_path: Path)
 def test_other_endings_are_refused_with_those_there_are(model: kv.Model, tmp_path: Path) -> None:
     with pytest.raises(kv.errors.FormatError) as info:
         model.save(tmp_path / "m.dae")
-    assert all(ending in str(info.value) for ending in ENDINGS)
+    assert all(ending in str(info.value) for ending in EVERY)
 
 
 @pytest.mark.parametrize("ending", ENDINGS)

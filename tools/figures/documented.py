@@ -13,6 +13,7 @@ from .rules import EXTREME, TIME, ByRow, Count, CountOf, Key, Largest, Mean, Rul
 from .short_forms import (
     CALIBRATED_DRAWS,
     CALIBRATED_DRIVES,
+    CHECK_SEED,
     FIG4_CONFIGURATIONS,
     HAND_EYES,
     LOCKBOXES,
@@ -425,6 +426,17 @@ LOCKBOX = (
     ),
 )
 
+CHECKS = (
+    DocumentedTable(
+        "checks",
+        "checks.md",
+        f"kineverse reproduce checks --seed {CHECK_SEED}",
+        "Broken models",
+        {"break": KEY, "kind of break": KEY, "found": CountOf(), "named rightly": CountOf()},
+        short_forms.checks,
+    ),
+)
+
 # Benchmarks that take minutes.
 _QUICKER = ("document", "geometry", "inverse_kinematics", "control")
 # They need robots and problems of other people, and minutes: they are on no page.
@@ -540,6 +552,6 @@ CALIBRATION = (
 
 DOCUMENTED = (
     *(*FIG4, *STURM, *STREAM, *JOINTS, *CALIBRATION, *MANIPULATION, *LOCKBOX, *BENCH, *DEPLOYMENT),
-    *CONVERSION,
+    *(*CONVERSION, *CHECKS),
 )
 """All tables, in the order of the pages."""

@@ -223,6 +223,17 @@ def lockbox() -> Tables:
     )
 
 
+CHECK_SEED = 200  # first seed of the page; the checks were made with others
+
+
+@cache
+def checks() -> Tables:
+    """Break one model in each way, by the first seed of the page."""
+    from kineverse_studies.experiments import Options, reproduce
+
+    return as_tables(reproduce("checks", options=Options(seed=CHECK_SEED, count=1)))
+
+
 def has_data(folder: str) -> bool:
     """Return whether there is a folder of other people's data."""
     return (DATA / folder).exists()

@@ -27,24 +27,25 @@ if TYPE_CHECKING:
 
 HELP = """\
 IN is any model that can be loaded. OUT is a document (.kv.json), which holds the whole model, URDF (.urdf),
-MJCF (.xml) or SDF (.sdf). A motion that the format cannot represent is refused by name, and nothing is
-written; with --tolerance, such motions are approximated, and a guaranteed bound on the errors of frames is
-printed. Constraints that the format cannot represent, such as locks and couplings of wheel speeds, are left
-out and listed on standard error; --strict refuses these, too, and --leave-out names exceptions. The new file
-is read back before it becomes OUT. It is written whole or not at all, and replaces a file only with --force.
-If OUT is a dash, a document goes to standard output. From URDF to URDF, names of materials and elements such
-as <transmission> and <gazebo> are kept.
+MJCF (.xml), SDF (.sdf) or USD (.usda, .usdc). A motion that the format cannot represent is refused by name,
+and nothing is written; with --tolerance, such motions are approximated, and a guaranteed bound on the errors
+of frames is printed. Constraints that the format cannot represent, such as locks and couplings of wheel
+speeds, are left out and listed on standard error; --strict refuses these, too, and --leave-out names
+exceptions. The new file is read back before it becomes OUT. It is written whole or not at all, and replaces a
+file only with --force. If OUT is a dash, a document goes to standard output. From URDF to URDF, names of
+materials and elements such as <transmission> and <gazebo> are kept.
 
-USD (.usda, .usdc, .usd) holds the document of the model beside joints for other tools, so nothing is
-refused unless --strict is given; needs the extra usd.
+USD (.usda, .usdc, .usd) holds the document of the model beside joints for other tools, so nothing is refused
+unless --strict is given; needs the extra usd.
 
 Mesh files are not copied; OUT refers to them by paths that are valid from its folder. Meshes that MuJoCo
 cannot read are converted, into a folder beside OUT; missing ones are left out of MJCF.
 
-With --check, an engine of the format reads OUT on its own: pinocchio a URDF, MuJoCo an MJCF, drake an SDF. In
-100 states within limits, the poses of all frames in OUT are compared with those of IN. If one differs by more
-than 1e-9 m or rad (an approximated one by more than its bound), the joint is named and the status is 1; OUT
-is kept. To compare IN and OUT by Kineverse alone: kineverse diff IN OUT --values
+With --check, an engine of the format reads OUT on its own: pinocchio a URDF, MuJoCo an MJCF, drake an SDF,
+OpenUSD a USD. In 100 states within limits, the poses of all frames in OUT are compared with those of IN. If
+one differs by more than 1e-9 m or rad (1e-6 in USD; an approximated one by more than its bound), the joint is
+named and the status is 1; OUT is kept. To compare IN and OUT by Kineverse alone: kineverse diff IN OUT
+--values
 
 examples:
   kineverse convert robot.sdf robot.urdf

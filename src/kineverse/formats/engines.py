@@ -10,7 +10,7 @@ import importlib
 import logging
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Container, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -36,16 +36,19 @@ _FREE = ("x", "y", "z", *_QUATERNION)
 class PoseEngine(ABC):
     """Engine that has read one file.
 
-    ``frames`` are the names in the model of all frames that it computes, and ``remarks`` say what it leaves
-    out.
+    ``frames`` are the names in the model of all frames that it computes, ``skipped`` of those that it cannot,
+    and ``remarks`` say why.
     """
 
+    name: ClassVar[str]
     package: ClassVar[str]  # name of its package in Python
     distribution: ClassVar[str]  # name under which it is installed
+    equal: ClassVar[float] = 1e-9  # largest difference of a pose [m], [rad] that is rounding
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self.frames: Sequence[str] = ()
+        self.skipped: Container[str] = ()
         self.remarks: list[str] = []
 
     @classmethod
@@ -55,8 +58,7 @@ class PoseEngine(ABC):
             return importlib.import_module(cls.package)
         except ImportError as error:
             raise MissingDependencyError(
-                f"{cls.package.partition('.')[0]}, which reads such a file, is not installed: "
-                f"{install_command('check')}"
+                f"{cls.name}, which reads such a file, is not installed: {install_command('check')}"
             ) from error
 
     @classmethod
@@ -79,13 +81,13 @@ class PoseEngine(ABC):
         """Return the error that the engine does not read the file."""
         lines = [line for line in str(error).strip().splitlines() if line.strip()]
         reason = lines[0] if lines else "it does not say why"
-        return FormatError(f"{self.path.name}: {self.distribution} does not read it: {reason}")
+        return FormatError(f"{self.path.name}: {self.name} does not read it: {reason}")
 
 
 class PinocchioEngine(PoseEngine):
     """URDF in pinocchio, where joints that mimic move freely; here they follow by multiplier and offset."""
 
-    package, distribution = "pinocchio", "pin"
+    name, package, distribution = "pinocchio", "pinocchio", "pin"
     _COMPOUND: ClassVar = {"planar": ("x", "y", "angle"), "floating": _FREE}
 
     def __init__(self, path: Path) -> None:
@@ -99,7 +101,7 @@ class PinocchioEngine(PoseEngine):
             raise self.refuse(error) from None
         self._data = self._model.createData()
         self._joints = {joint.get("name", ""): joint for joint in root.findall("joint")}
-        skipped = set(self._links_below_tilted_planes())
+        self.skipped = skipped = set(self._links_below_tilted_planes())
         body = self._pin.FrameType.BODY
         known = {f.name: k for k, f in enumerate(self._model.frames) if f.type == body}
         self._indices = {name: k for name, k in known.items() if name not in skipped}
@@ -156,7 +158,7 @@ class PinocchioEngine(PoseEngine):
 class MujocoEngine(PoseEngine):
     """MJCF in MuJoCo, whose equalities move nothing in its kinematics: joints follow by their polynomials."""
 
-    package, distribution = "mujoco", "mujoco"
+    name, package, distribution = "mujoco", "mujoco", "mujoco"
 
     def __init__(self, path: Path) -> None:
         super().__init__(path)
@@ -215,7 +217,7 @@ class DrakeEngine(PoseEngine):
     it: whether they close is computed from the poses of their ends. Followers are set by the rule of SDF.
     """
 
-    package, distribution = "pydrake.multibody.plant", "drake"
+    name, package, distribution = "drake", "pydrake.multibody.plant", "drake"
 
     def __init__(self, path: Path) -> None:
         super().__init__(path)

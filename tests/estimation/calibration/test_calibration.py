@@ -105,14 +105,14 @@ def check_statistics(seeds: range, bad: float, most: float, nees: tuple[float, f
     assert ratio <= most
     assert nees[0] <= consistency <= nees[1]
     for name, true in zip(("position", "orientation"), NOISE, strict=True):
-        assert np.mean([size[name] for size in sizes]) == pytest.approx(true, rel=0.03)
+        assert np.mean([size[name] for size in sizes]) == pytest.approx(true, rel=0.04)
     assert mistakes == 0
 
 
 @pytest.mark.parametrize("bad", [0.0, 0.1])
 def test_errors_are_near_the_bound_and_of_the_stated_size(bad: float) -> None:
-    # 10 draws of 13 errors: standard deviations are 6 % of the RMSE and 12 % of the NEES.
-    check_statistics(range(100, 110), bad, 1.15, (0.7, 1.35))
+    # 6 draws of 13 errors: standard deviations are 8 % of the RMSE and 16 % of the NEES.
+    check_statistics(range(100, 106), bad, 1.2, (0.6, 1.45))
 
 
 @pytest.mark.long
@@ -283,6 +283,34 @@ def test_everything_is_recovered_from_each_kind_of_observation(seen_as: str) -> 
     state = {kv.position(name): 0.3 for name in ("shoulder", "elbow", "spindle")}
     wanted = np.asarray(truth.fk("tip", "camera")({**state, REACH: 0.42}))
     np.testing.assert_allclose(model.fk("tip", "camera")({**state, reach: reach.value}), wanted, atol=1e-5)
+
+
+def test_a_closed_loop_is_calibrated() -> None:
+    model = kv.Model()
+    with model.edit() as edit:
+        edit.apply(kv.Revolute(name="a", parent="world", child="crank", axis=(0, 0, 1)))
+        edit.apply(
+            kv.Revolute(
+                name="b", parent="crank", child="rod", axis=(0, 0, 1), origin=kv.translation(0.3, 0, 0)
+            )
+        )
+        edit.apply(
+            kv.Revolute(
+                name="c", parent="world", child="rocker", axis=(0, 0, 1), origin=kv.translation(0.8, 0, 0)
+            )
+        )
+        edit.add_frame("rod end", "rod", kv.translation(0.7, 0, 0))
+        edit.add_frame("rocker end", "rocker", kv.translation(0, 0.6, 0))
+        edit.close_loop("rod end", "rocker end", mask=("x", "y"))
+    words, values = ["length rocker end", "offset a"], {"rocker end/length": 0.02, "a/offset": 0.03}
+    pose = corrected(model, words, values).fk("rod")
+    looks = [({"a": q}, {"rod": pose({kv.position("a"): q})}) for q in np.linspace(0.2, 2.0, 10).tolist()]
+    result = calibrate(model, looks, words)
+    assert np.abs(errors(result, values)).max() < 1e-8
+    result.apply(model)
+    np.testing.assert_allclose(
+        model.fk("rod")({kv.position("a"): 0.9}), pose({kv.position("a"): 0.9}), atol=1e-8
+    )
 
 
 class Beacon:

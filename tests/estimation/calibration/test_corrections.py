@@ -70,10 +70,14 @@ WORDS = {
 }
 
 
-@pytest.mark.parametrize("words", [*([word] for word in WORDS), list(WORDS)], ids=" ".join)
+@pytest.mark.parametrize("word", WORDS)
+def test_a_word_is_for_what_has_such_a_thing(word: str) -> None:
+    assert {c.name for c in find_corrections(MODEL, [f"{word} *"])} == WORDS[word]
+
+
+@pytest.mark.parametrize("words", [["axes"], ["wheels"], list(WORDS)], ids=" ".join)
 def test_operations_with_numbers_equal_the_expressions(words: list[str], tmp_path: Path) -> None:
     corrections = find_corrections(MODEL, [f"{word} *" for word in words])
-    assert {c.name for c in corrections} == set.union(*(WORDS[word] for word in words))
     rng = np.random.default_rng(len(words))
     values = {s: rng.normal(0, 0.05) for c in corrections for s in c.symbols}
     symbolic, numeric, untouched = MODEL.copy(), MODEL.copy(), MODEL.copy()

@@ -99,7 +99,7 @@ SETTINGS = [(30, 1.0), (10, 1.0), (30, 0.25), (10, 0.25)]
 
 @pytest.mark.parametrize(("count", "spread"), SETTINGS[:3:2])
 def test_hand_eye_beats_opencv_from_any_start(count: int, spread: float) -> None:
-    check_hand_eye(range(4), count, spread)
+    check_hand_eye(range(3), count, spread)
 
 
 @pytest.mark.long
@@ -120,7 +120,7 @@ def check_hand_eye(seeds: range, count: int, spread: float) -> None:
 def test_the_result_does_not_depend_on_the_start() -> None:
     case = hand_eye(np.random.default_rng(6), 15, 0.6)
     poses = []
-    for seed in range(4):
+    for seed in range(3):
         rng = np.random.default_rng(seed)
         model = case.model.copy()
         with model.edit() as edit:

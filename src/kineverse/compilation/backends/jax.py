@@ -193,12 +193,12 @@ def _in_c(
     """Return the function that calls compiled C; None if there is none."""
     jax = _import_jax()
     library = _library(program)
-    if not library.wait():
-        if required:
-            raise CompileError(f"The function cannot be compiled: {library.error}.")
-        return None
-    name = f"kineverse_{library.key}"
+    name = "" if library.error else f"kineverse_{library.key}"
     if name not in _registered:
+        if not library.wait():
+            if required:
+                raise CompileError(f"The function cannot be compiled: {library.error}.")
+            return None
         _registered[name] = library.code
         jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(library.code), platform="cpu")
 

@@ -396,7 +396,7 @@ def _make_blocks(model: Model, prepared: _Prepared, recordings: Sequence[Any]) -
     for unknown_parameter in prepared.unknowns:
         symbol = unknown_parameter.inner
         everywhere = {s for block in blocks for s in block.parameters} | set(model.symbols)
-        if not symbol.has_derivative and symbol not in everywhere:
+        if not unknown_parameter.unit and symbol not in everywhere:
             raise UnknownNameError(
                 f"Parameter '{symbol}' with the value {symbol.value:g} is neither in the model nor in an "
                 "observation."
@@ -558,7 +558,7 @@ def _result(
     directions, deviations = _directions(problem, fit)
     state = State({u.outer: float(v) for u, v in zip(unknowns, values, strict=True)}, source="calibration")
     tags = set(_by_tag(prepared.corrections))
-    new = {u.inner: parameter(u.inner.path, math.pi) for u in unknowns if not u.inner.has_derivative}
+    new = {u.inner: parameter(u.inner.path, math.pi) for u in unknowns if not u.unit}
     if new:
         ours = {tag: model.history.operation(tag) for tag in model.history.tags}
         tags |= {tag for tag, one in ours.items() if with_parameters(one, new) is not one}

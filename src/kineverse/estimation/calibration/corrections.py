@@ -21,6 +21,7 @@ from kineverse.articulations.single_axis import rotation_factors, unit_axis
 from kineverse.errors import InvalidValueError, UnknownNameError, suggest
 from kineverse.expressions.expression import Expression, ExpressionLike, array, as_expression
 from kineverse.lie import Array, smallest_rotation_from_z
+from kineverse.loops import CloseLoop
 from kineverse.model.basic_operations import AddFrame, Attach, Override
 from kineverse.model.body import Pose
 from kineverse.model.frame import Frame, TransformLike
@@ -28,7 +29,7 @@ from kineverse.model.model import Model
 from kineverse.model.operation import Operation, Writes
 from kineverse.model.read_recorder import ReadRecorder
 from kineverse.spatial import X, Y, Z, exp_so3, translation_along
-from kineverse.symbols import Symbol, symbol
+from kineverse.symbols import Symbol, parameter, symbol
 
 Factors = tuple["Pose | Expression", ...]
 
@@ -359,11 +360,12 @@ def _matching(model: Model, word: str, pattern: str) -> list[Correction]:
         hint = suggest(pattern, tags, "such name")
         raise UnknownNameError(f"Nothing is named '{pattern}' among the {kind}. {hint}")
     result: dict[str, Correction] = {}
+    has_loops = any(isinstance(_inner(entry.operation), CloseLoop) for entry in model.history.sequence)
     for name, tag in matching.items():
         operation = _inner(model.history.operation(tag)) if tag else None
         for kind in kinds:
             if operation is not None and tag not in result and _KINDS[kind].suits(operation):
-                result[tag] = _make_correction(kind, name, tag, operation)
+                result[tag] = _make_correction(kind, name, tag, operation, has_loops)
     if not result:
         suited = [
             name
@@ -394,12 +396,15 @@ def _writer(model: Model, kind: str, name: str) -> str:
     return ""
 
 
-def _make_correction(kind: str, name: str, tag: str, operation: Any) -> Correction:
+def _make_correction(kind: str, name: str, tag: str, operation: Any, has_loops: bool) -> Correction:
     name = str(operation.name) if isinstance(operation, PlacedOperation) else name
     parts = _KINDS[kind].parts
     units = tuple(unit or _coordinate_unit(operation) for _, unit in parts)
-    # With derivatives, so that they are columns of a geometric Jacobian, and no names of joints.
-    symbols = tuple(symbol(f"{name}/{part}", role="location") for part, _ in parts)
+    symbols = tuple(
+        # With derivatives they are columns of a geometric Jacobian. Loops would take them for coordinates.
+        parameter(f"{name}/{part}", 0.0) if has_loops else symbol(f"{name}/{part}", role="location")
+        for part, _ in parts
+    )
     return Correction("wheels" if kind == "mecanum" else kind, name, tag, symbols, units)
 
 

@@ -147,7 +147,9 @@ class SdfWriter:
 
     def _plan(self, link: LinkDescription) -> list[_SdfJoint]:
         """Return the joints of a link, and assign the names of their coordinates."""
-        planned = list(_merge_joints(link, self._home, self._looped))
+        if self._free_name(link) is not None:
+            return []
+        planned = list(_merge_joints(link, self._looped))
         for joint in planned:
             joint.name = self._take_joint(joint.coordinate)
             if joint.is_independent:
@@ -396,9 +398,7 @@ def _position(joint: JointDescription, home: Mapping[str, float]) -> float:
     return float(np.polynomial.polynomial.polyval(home.get(joint.symbol.path, 0.0), joint.coefficients))
 
 
-def _merge_joints(
-    link: LinkDescription, home: Mapping[str, float], looped: Iterable[str]
-) -> Iterable[_SdfJoint]:
+def _merge_joints(link: LinkDescription, looped: Iterable[str]) -> Iterator[_SdfJoint]:
     """Yield the joints of a link in SDF: those of a screw and of a universal joint are one."""
     joints = list(link.joints)
     if len(joints) == 2 and all(isinstance(joint, JointDescription) for joint in joints):

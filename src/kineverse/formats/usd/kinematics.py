@@ -129,7 +129,7 @@ class UsdEngine(PoseEngine):
     Kinematic bodies, which no joint moves, and what they carry have no poses here.
     """
 
-    package, distribution = "pxr", "usd-core"
+    name, package, distribution = "usd-core", "pxr", "usd-core"
     equal = 1e-6  # joints are in single precision
 
     def __init__(self, path: Path) -> None:
@@ -139,6 +139,9 @@ class UsdEngine(PoseEngine):
         still = self._tree.still
         self.frames = [body.name for place, body in scene.bodies.items() if place not in still]
         self.frames += [frame.name for frame in scene.frames if frame.body not in still]
+        self.skipped = {body.name for place, body in scene.bodies.items() if place in still}
+        self.skipped |= {frame.name for frame in scene.frames if frame.body in still}
+        self.remarks = ["usd-core reads the file, and has no kinematics: these are of Kineverse"]
         self.remarks += [
             f"no joint of the file moves '{scene.bodies[place].name}': it is not compared" for place in still
         ]

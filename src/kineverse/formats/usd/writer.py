@@ -137,6 +137,8 @@ def _check_read_back(stage: Any, expected: Mapping[str, Matrix], home: Mapping[s
     poses = StagePoses(read_scene(stage, "what would be written"))
     found = poses.at(home)
     for name, pose in expected.items():
+        if any(ord(character) < 32 for character in name):  # readers replace these
+            continue
         error = float(np.abs(found[name] - pose).max()) if name in found else math.inf
         size = max(1.0, float(np.abs(pose[:3, 3]).max()))  # single precision is relative to the distance
         if not error <= READ_BACK_TOLERANCE * size:
