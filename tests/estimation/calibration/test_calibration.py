@@ -328,6 +328,7 @@ class Beacon:
         self.function = kv.compile([square, slopes], [*coordinates, *self.parameters])
         self.rows = np.array([[state[str(s)] for s in coordinates] for state in self.states])
         self.looks = look + np.zeros(len(self.rows), dtype=int)
+        self.start = None
         return self
 
     label = "beacon"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -160,6 +161,32 @@ def test_slips_and_gross_errors(fetch: kv.Model) -> None:
         assert np.sqrt(error**2 / np.diag(found.covariance)).max() < 4.5
         listed = {outlier.look for outlier in found.outliers}
         assert listed >= {int(k) for k in np.flatnonzero(bad)} - {0, 1, 2}
+
+
+def test_a_drive_that_turns_far_from_where_the_present_wheels_lead(fetch: kv.Model) -> None:
+    drive, _ = fetch_drive(5)
+    off = fetch.copy()
+    base = off.history.operation("joint fetch/base")
+    with off.edit() as edit:
+        edit.replace("joint fetch/base", replace(base, radius=(0.066, 0.056), track=0.34))
+    found = calibrate(off, [drive], "wheels fetch/base", held_out=0)
+    changed = off.copy()
+    found.apply(changed)
+    wheels = changed.history.operation("joint fetch/base")
+    assert isinstance(wheels, DifferentialDrive)
+    assert np.abs(np.array([*wheels.radii, wheels.track]) / (SIZES + TRUE) - 1).max() < 0.001
+
+
+def test_one_doubtful_pose_is_no_slip(fetch: kv.Model) -> None:
+    drive, _ = fetch_drive(6, noise=0.2)
+    poses = np.array(drive.poses)
+    poses[20] = poses[20] @ lie.transform(lie.rotation_z(np.array(0.008)), np.array([0.003, -0.003, 0.0]))
+    fields = {k: getattr(drive, k) for k in ("base", "times", "wheels", "seen_at")}
+    prepared = _prepare(fetch, ["wheels fetch/base"])
+    inner = [u.inner for u in prepared.unknowns]
+    block = WheelOdometry(**fields, poses=poses).residual_block(prepared.model, inner, 0)
+    assert len(block.pieces) == 1
+    assert block.kept.sum() >= len(poses) - 2
 
 
 def test_a_start_is_estimated_anew_where_it_is_wanted(fetch: kv.Model) -> None:

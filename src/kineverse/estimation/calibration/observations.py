@@ -136,6 +136,10 @@ class ResidualBlock(Protocol):
     def covariance(self) -> Array | None:
         """Covariances (N, m, m); None for noise of an unknown size."""
 
+    @property
+    def start(self) -> Array | None:
+        """Parameters near the best ones, if the recording tells them by itself."""
+
     def evaluate(self, values: Array) -> tuple[Array, Array]:
         """Return residuals (N, m), observed less predicted, and their Jacobian (N, m, p)."""
         ...
@@ -190,6 +194,7 @@ class CompiledBlock:
     inputs: Array  # (N, n)
     covariance: Array | None
     period: float = math.inf
+    start: Array | None = None
 
     def __post_init__(self) -> None:
         self.parameters = self.kernel.parameters

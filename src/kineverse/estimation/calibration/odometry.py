@@ -300,6 +300,7 @@ class OdometryBlock:
         self.covariance = None if stated is None else np.broadcast_to(stated, (len(self._poses), 6, 6))
         self._compile(given, model, record, frame, free)
         self._weights = np.ones(6) if stated is None else 1.0 / np.sqrt(np.diag(stated))
+        self.start: Array | None = None
         self.pieces, self.kept = [np.arange(len(self._poses))], np.ones(len(self._poses), dtype=bool)
         self._cut(given.restart)
 
@@ -418,18 +419,18 @@ class OdometryBlock:
         values, drive = self._fit_motions()
         pieces: list[list[int]] = [[0]]
         kept = self.kept
-        good, doubted, begun = 0, list[int](), float(self._readings.seen_at[0])
+        good, before, doubted, begun = 0, -1, list[int](), float(self._readings.seen_at[0])
         for k in range(1, len(self._poses)):
             now = float(self._readings.seen_at[k])
             if restart is not None and now - begun > restart:
                 pieces[-1] += doubted
                 pieces.append([k])
-                good, doubted, begun = k, [], now
+                good, before, doubted, begun = k, -1, [], now
                 continue
             if self._fits(drive, good, k):
                 pieces[-1] += [*doubted, k]
                 kept[doubted] = False
-                good, doubted = k, []
+                good, before, doubted = k, good, []
                 continue
             if doubted and not self._fits(drive, doubted[-1], k):
                 pieces[-1] += doubted
@@ -437,9 +438,13 @@ class OdometryBlock:
                 doubted = []
             doubted.append(k)
             if len(doubted) == _PERSISTENT:
-                begun = float(self._readings.seen_at[doubted[0]])
-                pieces.append(doubted)
-                good, doubted = k, []
+                if before >= 0 and self._fits(drive, before, k):
+                    kept[good] = False  # it was that one, which fitted by chance
+                    pieces[-1] += doubted
+                else:
+                    begun = float(self._readings.seen_at[doubted[0]])
+                    pieces.append(doubted)
+                good, before, doubted = k, doubted[-2], []
         pieces[-1] += doubted
         kept[doubted] = False
         self.pieces = [np.array(piece) for piece in pieces]
@@ -448,6 +453,7 @@ class OdometryBlock:
                 pass
             squares = np.square(self.evaluate(values)[0] * self._weights).sum(axis=1)
             self.kept[:] = squares < CHI_SQUARED_6
+        self.start = values
 
     def _split_once(self, values: Array) -> bool:
         """Divide a piece where a further start improves the fit the most; return False if none does."""
@@ -519,7 +525,7 @@ class OdometryBlock:
 
     def _fit_motions(self) -> tuple[Array, _Drive]:
         """Fit the motions between successive poses, and with them the noise of a pose unless it is known."""
-        values = self._present
+        values = self._present.copy()
         drive = self._drive(values)
         if len(self._poses) < 2:
             return values, drive

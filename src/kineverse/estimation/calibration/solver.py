@@ -196,7 +196,7 @@ class CalibrationProblem:
 
     def solve(self, start: Array, present: Array) -> CalibrationFit:
         """Return the most likely parameters from a start; those that nothing tells are the present ones."""
-        values, linear = self._approach(start)
+        values, linear = self._approach(self._nearest_start(start))
         # From above, so that no observation of few is lost at once.
         noise = {n: max(size, self.medians.get(n, 0.0)) for n, size in self.median_noise(linear).items()}
         noise |= self.known
@@ -221,6 +221,21 @@ class CalibrationProblem:
         values, linear = self._hold_untold(values, linear, weights, noise, present)
         hessian = self.normal_equations(linear, weights, noise).hessian
         return CalibrationFit(values, noise, weights, linear, hessian, pseudo_inverse(hessian)[1])
+
+    def _nearest_start(self, start: Array) -> Array:
+        """Return a start with the values that blocks propose, of each block that fits better by its own."""
+        best, spread = start, self._spread(start)
+        for block, columns in zip(self.blocks, self.columns, strict=True):
+            if block.start is not None:
+                proposed = best.copy()
+                proposed[columns] = block.start / self.scales[columns]
+                if (reached := self._spread(proposed)) < spread:
+                    best, spread = proposed, reached
+        return best
+
+    def _spread(self, values: Array) -> float:
+        """Return the sum of the logarithms of the median residuals of all groups."""
+        return float(np.log([*self.median_noise(self.linearise(values)).values()]).sum())
 
     def refit(self, fit: CalibrationFit, keep: Sequence[Array]) -> Array:
         """Return the parameters from some of the observations, at the weights and the noise of a fit."""
