@@ -95,6 +95,14 @@ def test_several_files_are_told_apart(run, lid, tmp_path):
     status, out, _ = run(lid(upper=90), "kitchens/2", "--motion")
     assert status == 1
     assert "turns 14.3 times" in out
+    twin = tmp_path / "twin" / "box.urdf"
+    twin.parent.mkdir()
+    twin.write_bytes((tmp_path / "box.urdf").read_bytes())
+    pictures = ["--pictures", str(tmp_path / "pictures")]
+    answer = json.loads(run(lid(upper=90), str(twin), "--motion", "--json", *pictures)[1])
+    drawn = [one["file"] for file in answer["coordinates"] for one in file["pictures"]]
+    names = ["box.lid.degrees_for_radians.png", "box.lid.degrees_for_radians.2.png"]
+    assert drawn == [str(tmp_path / "pictures" / name) for name in names]
 
 
 def test_pictures_show_the_part_in_orange_where_it_is_worst(run, lid, tmp_path):

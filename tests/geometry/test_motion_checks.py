@@ -225,6 +225,8 @@ def test_crossed_limits_are_a_finding_by_a_second_constraint_and_by_the_remarks_
         loaded = kv.load(file)
     assert "crossed_limits" in kinds(check_motion(loaded, remarks), "j")
     assert "crossed_limits" not in kinds(check_motion(loaded), "j")
+    prefixed = check_motion(kv.load(file, prefix="home"), remarks)
+    assert [(entry.kind, entry.joint) for entry in prefixed.at_rest.findings] == [("crossed_limits", "j")]
 
 
 # Units
@@ -236,6 +238,7 @@ def test_crossed_limits_are_a_finding_by_a_second_constraint_and_by_the_remarks_
         (0.0, MOST_TURNS * math.tau - 0.1, None),
         (0.0, MOST_TURNS * math.tau + 0.1, "degrees_for_radians"),
         (0.0, 4 * math.tau, None),  # a valve of four turns
+        (0.0, 44.0, "degrees_for_radians"),  # nearly seven turns
         (-12.56, 12.56, None),  # with π as 3.14
         (0.0, 4 * math.tau + 2 * WHOLE_TURNS, "degrees_for_radians"),
         (-1e6, 1e6, None),  # no limit
@@ -261,6 +264,32 @@ def test_a_screw_may_turn_as_often_as_it_likes():
         origin=SLIDE.origin,
     )  # fmt: skip
     assert not check_motion(cupboard(slide=screw, drawer=body(shape(0.4, 0.1, 0.1)))).findings
+
+
+def geared(ratio, axis=(-1, 0, 0), upper=None, square=False):
+    """Return the cupboard whose drawer a crank moves."""
+    crank = kv.position("crank")
+    joint = {"name": "drawer", "parent": "cupboard", "child": "drawer", "axis": axis, "origin": SLIDE.origin}
+    model = cupboard(slide=kv.Prismatic(**joint, position=ratio * (crank**2 if square else crank)))
+    if upper is not None:
+        with model.edit() as edit:
+            edit.constrain("crank", 0.0, crank, upper)
+    return model
+
+
+@pytest.mark.parametrize("square", [False, True])
+@pytest.mark.parametrize("ratio", [2e-4, 0.02, 3.0])
+def test_a_part_is_swept_by_what_its_gear_makes_of_the_coordinate(ratio, square):
+    """A spindle of 1 mm a turn is a gear, and a cam stands still at the default state."""
+    upper = 0.35 / ratio
+    upper = math.sqrt(upper) if square else upper
+    report = check_motion(geared(ratio, upper=upper, square=square))
+    assert not (*report.findings, *report.suspects)
+    (suspect,) = check_motion(geared(ratio, (0, 1, 0), upper, square)).suspects
+    assert suspect.kind == ("into_carrier" if square else "turned_axis")
+    if not square:
+        (suspect,) = check_motion(geared(ratio, (1, 0, 0))).suspects
+        assert suspect.kind == "no_limits"
 
 
 @pytest.mark.parametrize(
@@ -515,7 +544,7 @@ def test_a_range_without_limits_is_half_a_turn_or_the_size_of_the_part():
     model = cupboard(hinge=replace(HINGE, lower=None, upper=None), slide=replace(SLIDE, lower=None))
     parts = MovingParts(model)
     door, drawer = (MovingPart(parts, parts.groups[k], parts.groups[k].coordinates[0]) for k in (1, 2))
-    assert door.range == (-math.pi, math.pi)
+    assert door.range == pytest.approx((-math.pi, math.pi))
     assert drawer.range == (pytest.approx(-0.54), 0.35)
 
 

@@ -100,7 +100,7 @@ def run(arguments: argparse.Namespace) -> int:
     options = {"meshes": not arguments.no_meshes, "strict": arguments.strict, "root": arguments.root}
     further = find_penetrations if arguments.contacts else None
     results = [validate_file(file, loops=arguments.loops, further=further, **options) for file in files]
-    motions = [check_result(result, arguments.pictures) for result in results] if arguments.motion else []
+    motions = check_results(results, arguments.pictures) if arguments.motion else []
     if motions:
         results = [_without_inertia(result) for result in results]
     statuses = [result.status for result in results]
@@ -146,16 +146,23 @@ class CheckedMotion:
         return bool(self.report.findings or self.report.suspects)
 
 
-def check_result(result: ValidationResult, folder: Path | None) -> CheckedMotion | None:
-    """Check the motions of a file, and draw what is found; None for a file that cannot be read."""
-    if result.model is None:
-        return None
-    report = check_motion(result.model, result.faults)
-    if folder is None:
-        return CheckedMotion(report)
-    from kineverse.view.finding_pictures import save_finding_pictures  # for start-up time
+def check_results(results: list[ValidationResult], folder: Path | None) -> list[CheckedMotion | None]:
+    """Check the motions of files, and draw what is found; None for a file that cannot be read."""
+    checked: list[CheckedMotion | None] = []
+    taken: set[str] = set()
+    for result in results:
+        if result.model is None:
+            checked.append(None)
+            continue
+        report = check_motion(result.model, result.faults)
+        pictures: tuple[tuple[str, str, Path], ...] = ()
+        if folder is not None:
+            from kineverse.view.finding_pictures import save_finding_pictures  # for start-up time
 
-    return CheckedMotion(report, tuple(save_finding_pictures(result.model, report, folder)))
+            before = f"{Path(result.name).stem}." if len(results) > 1 else ""
+            pictures = tuple(save_finding_pictures(result.model, report, folder, before, taken))
+        checked.append(CheckedMotion(report, pictures))
+    return checked
 
 
 def _without_inertia(result: ValidationResult) -> ValidationResult:
@@ -171,10 +178,12 @@ def format_motion(motion: CheckedMotion, most: int | None) -> list[str]:
     style = "!" if report.findings else "~" if report.suspects else "+"
     lines = [f"  motion of {format_count(len(report.coordinates), 'coordinate')}: {colorize(said, style)}"]
     for title, severity in (("findings", "finding"), ("suspects", "suspect"), ("cannot say", "cannot_say")):
-        entries = [
-            (one.name, entry) for one in report.all for entry in one.entries if entry.severity == severity
+        texts = [
+            _format_entry(one.name, entry)
+            for one in report.all
+            for entry in one.entries
+            if entry.severity == severity
         ]
-        texts = [line for name, entry in entries for line in [_format_entry(name, entry)]]
         if texts:
             lines += [f"  {title}", *truncate_lines(texts, most, "    ")]
     if motion.pictures:
@@ -191,11 +200,9 @@ def _format_entry(name: str, entry: MotionFinding) -> str:
     if entry.severity == "cannot_say" or not (entry.advice or numbers):
         return first
     if entry.value is not None and entry.limit is not None:
-        pair = (
-            f"{format_number(entry.value, 3)} {entry.unit}",
-            f"{format_number(entry.limit, 3)} {entry.unit}",
-        )
-        numbers.append(f"{pair[0]}, where {pair[1]} is accepted")
+        unit = "" if entry.unit == "1" else f" {entry.unit}"
+        value, limit = (f"{format_number(number, 3)}{unit}" for number in (entry.value, entry.limit))
+        numbers.append(f"{value}, where {limit} is accepted")
     return f"{first}\n      {'; '.join(filter(None, [*numbers, entry.advice]))}"
 
 
@@ -206,16 +213,11 @@ def motions_to_json(results: list[ValidationResult], motions: list[CheckedMotion
     coordinates: list[dict[str, Any]] = []
     at_rest: list[dict[str, Any]] = []
     for result, motion in zip(results, motions, strict=True):
-        for one in motion.report.all if motion is not None else ():
-            pictures = (
-                [
-                    {"kind": kind, "file": str(path)}
-                    for name, kind, path in motion.pictures
-                    if name == one.name
-                ]
-                if motion is not None
-                else []
-            )
+        if motion is None:
+            continue
+        for one in motion.report.all:
+            files = [(kind, str(path)) for name, kind, path in motion.pictures if name == one.name]
+            pictures = [{"kind": kind, "file": file} for kind, file in files]
             data = one.to_json() | {"file": result.name, "pictures": pictures}
             (coordinates if one.name else at_rest).append(data)
     return {"coordinates": coordinates, "at_rest": at_rest}

@@ -75,13 +75,13 @@ def draw_finding(model: ModelView, finding: MotionFinding) -> npt.NDArray[np.uin
 
 
 def save_finding_pictures(
-    model: ModelView, report: MotionReport, folder: Path
+    model: ModelView, report: MotionReport, folder: Path, before: str, taken: set[str]
 ) -> Iterator[tuple[str, str, Path]]:
     """Write a PNG of each finding and suspect that a picture can show.
 
-    Each result is the name of the coordinate, the kind, and the file.
+    Names of files begin with ``before``, and are none of those taken. Each result is the name of the
+    coordinate, the kind, and the file.
     """
-    taken: set[str] = set()
     for one in report.all:
         for entry in (*one.findings, *one.suspects):
             try:
@@ -90,7 +90,7 @@ def save_finding_pictures(
                 pixels = None
             if pixels is None:
                 continue
-            name = _file_name(f"{one.name or entry.bodies[0]}.{entry.kind}", taken)
+            name = _file_name(f"{before}{one.name or entry.bodies[0]}.{entry.kind}", taken)
             write_png(folder / name, pixels)
             yield one.name, entry.kind, folder / name
 

@@ -72,7 +72,6 @@ def _meshes(body: Body) -> list[Mesh]:
 def _check_mass(
     parts: MovingParts, name: str, inertia: Inertia, is_certain: bool, joint: str
 ) -> Iterator[MotionFinding]:
-    shape: PartShape | None = parts.body_shape(name)
     if not any(_compare(parts, inertia, parts.body_shape(name), is_certain)):
         return
     # What collides is often less than what is there. The meshes that are drawn are read only now.

@@ -44,18 +44,25 @@ def check_motion(model: ModelView, faults: Iterable[str] = ()) -> MotionReport:
     """
     import_coal()
     parts = MovingParts(model)
-    crossed = {fault.joint: str(fault) for fault in faults if isinstance(fault, CrossedLimits)}
+    crossed = {fault.joint: fault for fault in faults if isinstance(fault, CrossedLimits)}
     seen: set[int] = {0}
     reports = []
     for coordinate in model.degrees_of_freedom:
         name = str(coordinate)
         entries = list(_check_coordinate(parts, coordinate, seen))
-        if name in crossed:
-            entries.insert(0, MotionFinding("crossed_limits", "finding", crossed[name], joint=name))
+        for joint in {name: None} | {group.joint: None for group in parts.groups.moved_by(coordinate)}:
+            if joint in crossed:
+                entries.insert(0, _crossed(crossed.pop(joint)))
         reports.append(CoordinateReport(name, tuple(entries)))
     has_robot = any(parts.is_robot_link(group) for group in list(parts.groups)[1:])
-    rest = tuple(check_bodies(parts, parts.groups[0].bodies, not has_robot))
-    return MotionReport(tuple(reports), CoordinateReport("", rest))
+    rest = check_bodies(parts, parts.groups[0].bodies, not has_robot)
+    # Of a joint that no coordinate is named for, as with a prefix, or one that cannot move.
+    lost = map(_crossed, crossed.values())
+    return MotionReport(tuple(reports), CoordinateReport("", (*lost, *rest)))
+
+
+def _crossed(fault: CrossedLimits) -> MotionFinding:
+    return MotionFinding("crossed_limits", "finding", str(fault), joint=fault.joint)
 
 
 def _check_coordinate(parts: MovingParts, coordinate: Symbol, seen: set[int]) -> Iterator[MotionFinding]:

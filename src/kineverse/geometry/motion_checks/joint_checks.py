@@ -12,6 +12,7 @@ from kineverse.expressions.printing import format_number
 
 from .moving_parts import MovingPart, MovingParts, has_shapes
 from .report import MotionFinding, Severity, format_length
+from .rigid_groups import STILL, Axis
 
 MOST_TURNS = 2.25
 """Range of a hinge beyond which its limits are taken for degrees, in turns: 810°.
@@ -75,21 +76,20 @@ def check_joint_limits(part: MovingPart) -> Iterator[MotionFinding]:
             part, "crossed_limits", text, value=-extent, limit=0.0, unit="rad" if part.turns else "m"
         )
         return
-    if not math.isfinite(extent) or extent == 0.0:
+    if not math.isfinite(extent) or extent == 0.0 or part.axis is None:
         return
-    if part.turns:
-        yield from _check_angles(part, extent)
+    if part.axis.turn:
+        yield from _check_angles(part, part.axis, extent)
     elif part.solids and not part.parts.is_normalized:
-        yield from _check_lengths(part, extent)
+        yield from _check_lengths(part, extent * part.axis.shift)
 
 
-def _check_angles(part: MovingPart, extent: float) -> Iterator[MotionFinding]:
-    axis = part.axis
-    assert axis is not None
+def _check_angles(part: MovingPart, axis: Axis, extent: float) -> Iterator[MotionFinding]:
     angle = extent * axis.turn  # of the part, which may be geared
-    drives_slider = (axis.shift != 0.0 and abs(axis.shift) > 1e-9) or _shifts_another(part)
+    drives_slider = abs(axis.shift) > STILL or _shifts_another(part)
     turns = angle / math.tau
-    is_whole = abs(angle - math.tau * round(turns)) < WHOLE_TURNS
+    # Whole degrees are no whole turns, though 44 rad nearly are.
+    is_whole = abs(angle - math.tau * round(turns)) < WHOLE_TURNS and not extent.is_integer()
     if turns > MOST_TURNS and angle <= LARGEST_ANGLE and not is_whole and not drives_slider:
         shown = format_number(turns, 3), format_number(extent)
         text = f"turns {shown[0]} times; as degrees, a range of {shown[1]} is usual"
@@ -110,9 +110,7 @@ def _shifts_another(part: MovingPart) -> bool:
     return any(other.axis is not None and not other.turns for other in others)
 
 
-def _check_lengths(part: MovingPart, extent: float) -> Iterator[MotionFinding]:
-    assert part.axis is not None
-    travel = extent * part.axis.shift
+def _check_lengths(part: MovingPart, travel: float) -> Iterator[MotionFinding]:
     if travel < min(LEAST_TRAVEL, LEAST_SHARE * part.size):
         text = f"moves by {format_length(travel)} only, and is {format_length(part.size)} large"
         yield _finding(part, "millimetres_for_metres", text, value=travel, limit=LEAST_TRAVEL, unit="m")
@@ -132,15 +130,13 @@ def check_joint_axis(part: MovingPart) -> Iterator[MotionFinding]:
     most = AXIS_GAP * part.size
     if part.shape.distance_to_line(axis.point, axis.direction) <= most:
         return
-    others = part.parts.others(part.group)
-    gaps = [part.shape.distance_to_line(axis.point, axis.direction)]
-    gaps += [part.parts.shape_of([b]).distance_to_line(axis.point, axis.direction) for b in others]
-    if min(gaps) > most:
-        text = f"turns about an axis that is {format_length(min(gaps))} away from it and from all else"
-        severity: Severity = (
-            "suspect" if part.is_robot_link or not part.parts.solids(part.carrier) else "finding"
-        )
-        yield _finding(part, "axis_outside", text, severity, value=min(gaps), limit=most, unit="m")
+    others = (part.parts.shape_of([body]) for body in part.parts.others(part.group))
+    gap = min(shape.distance_to_line(axis.point, axis.direction) for shape in (part.shape, *others))
+    if gap > most:
+        text = f"turns about an axis that is {format_length(gap)} away from it and from all else"
+        is_certain = not part.is_robot_link and part.parts.solids(part.carrier)
+        severity: Severity = "finding" if is_certain else "suspect"
+        yield _finding(part, "axis_outside", text, severity, value=gap, limit=most, unit="m")
 
 
 def check_plane(part: MovingPart) -> Iterator[MotionFinding]:
@@ -191,14 +187,12 @@ def check_scale(parts: MovingParts, bodies: Sequence[str], joint: str = "") -> I
     most = min(LARGEST_PART, SCALE * rest or LARGEST_PART)
     sizes = {body: parts.body_shape(body).size for body in bodies}
     largest, smallest = max(bodies, key=sizes.__getitem__), min(bodies, key=sizes.__getitem__)
+    others = ""
     if sizes[largest] > most:
-        body, limit, others = (
-            largest,
-            most,
-            f", and all others together {format_length(rest)}" if rest else "",
-        )
+        body, limit = largest, most
+        others = f", and all others together {format_length(rest)}" if rest else ""
     elif sizes[smallest] < SMALLEST_PART:
-        body, limit, others = smallest, SMALLEST_PART, ""
+        body, limit = smallest, SMALLEST_PART
     else:
         return
     text = f"'{body}' is {format_length(sizes[body])} large{others}"

@@ -177,8 +177,9 @@ class MovingPart:
 
     @cached_property
     def axis(self) -> Axis | None:
-        """Axis at the default state in the frame of the carrier; None if the part does not move there."""
-        return self._axis_at(self.home)
+        """Axis in the frame of the carrier, at the default state or at a limit; None if it moves at none."""
+        values = filter(math.isfinite, (self.home, *self.limits))
+        return next(filter(None, map(self._axis_at, values)), None)
 
     @cached_property
     def fixed_axis(self) -> Axis | None:
@@ -215,13 +216,17 @@ class MovingPart:
     def range(self) -> tuple[float, float]:
         """Range in which the part is looked at [rad], [m].
 
-        Without a limit on a side, that is half a turn, or the size of the part.
+        Without a limit on a side, the part turns by half a turn, or moves by its size.
         """
         lower, upper = self.limits
-        reach = math.pi if self.turns else max(self.size, 1e-3)
+        reach = (math.pi if self.turns else max(self.size, 1e-3)) / (self.axis.rate if self.axis else 1.0)
         lower = lower if math.isfinite(lower) else min(self.home, upper) - reach
         upper = upper if math.isfinite(upper) else max(self.home, lower) + reach
         return lower, upper
+
+    def is_unlimited(self, state: State) -> bool:
+        """Return True if no limit is on the side of a state."""
+        return math.isinf(self.limits[state[self.coordinate] > self.home])
 
     def states(self, mirrored: bool = False) -> list[State]:
         """Return states over the range, or over its mirror image about the default."""

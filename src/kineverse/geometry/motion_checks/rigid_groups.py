@@ -24,7 +24,12 @@ STEP = 1e-4
 The error of the axis is about the step times the change of the axis, and rounding over the step, 1e-12.
 """
 
-LEAST_TURN = 1e-3  # turn by a unit of the coordinate below which a motion counts as a shift [rad]
+STILL = 1e-6
+"""Turn or shift by a unit of the coordinate that counts as none [rad], [m].
+
+A spindle shifts its nut by 1e-4 m/rad. Loops are closed to 1e-11, which STEP makes 1e-7.
+"""
+
 SAME_AXIS = 1e-3  # tilt, and offset over the size of the part, of two axes that count as one
 
 
@@ -50,6 +55,11 @@ class Axis:
     point: Floats  # (3,) a point of the axis [m]
     turn: float  # by a unit of the coordinate [rad]
     shift: float  # along the direction by a unit of the coordinate [m]
+
+    @property
+    def rate(self) -> float:
+        """Turn by a unit of the coordinate [rad]; of a motion without one, shift [m]."""
+        return self.turn or self.shift
 
 
 class RigidGroups(Sequence[RigidGroup]):
@@ -137,9 +147,9 @@ class RigidGroups(Sequence[RigidGroup]):
         middle = (before[:3, 3] + after[:3, 3]) / 2
         velocity = (after[:3, 3] - before[:3, 3]) / (2 * STEP)
         speed = float(np.linalg.norm(turn))
-        if speed < LEAST_TURN:
+        if speed < STILL:
             length = float(np.linalg.norm(velocity))
-            if length < LEAST_TURN:
+            if length < STILL:
                 return None
             return Axis(velocity / length, middle, 0.0, length)
         direction = unit_vector(turn)

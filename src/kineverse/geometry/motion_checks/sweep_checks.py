@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -17,7 +17,7 @@ from kineverse.geometry.mesh_files import Floats
 from kineverse.geometry.objects import collision_shapes
 from kineverse.geometry.scene import Scene
 from kineverse.geometry.shapes import sample_inside
-from kineverse.lie import inverse, rotation_along_z, transform
+from kineverse.lie import inverse, rotation_along_z, translation
 from kineverse.model.body import Body, Mesh, Pose
 from kineverse.model.model import Model
 from kineverse.state import State
@@ -25,6 +25,7 @@ from kineverse.symbols import position
 
 from .moving_parts import STATES, MovingPart
 from .report import MotionFinding, Severity, format_length
+from .rigid_groups import Axis
 
 AWAY = 0.25  # distance from all others, in sizes of the part, at which it floats or has come apart
 SMALL_GAP = (
@@ -226,8 +227,7 @@ def check_sweep(part: MovingPart) -> Iterator[MotionFinding]:
         yield from _floating(part, sweep)
         return
     yield from _gap(part, sweep)
-    lower, upper = part.limits
-    if lower > upper or not part.parts.default or lower == upper:
+    if part.limits[0] == part.limits[1]:
         return
     overlap = next(filter(sweep.is_confirmed, sweep.overlaps()), None)
     loose = sweep.loose_state()
@@ -247,9 +247,8 @@ def _floating(part: MovingPart, sweep: Sweep) -> Iterator[MotionFinding]:
     severity: Severity = "suspect" if part.is_robot_link else "finding"
     parts = part.parts
     parts.scene.update(parts.default)
-    distance = min(
-        r.distance for b in part.solids for o in sweep.others for r in parts.scene.distances([(b, o)])
-    )
+    pairs = [(body, other) for body in part.solids for other in sweep.others]
+    distance = min(found.distance for found in parts.scene.distances(pairs))
     text = f"is {format_length(distance)} away from everything, and {format_length(part.size)} large"
     yield _entry(part, "floats", severity, text, value=distance, limit=sweep.reach, unit="m")
 
@@ -257,28 +256,20 @@ def _floating(part: MovingPart, sweep: Sweep) -> Iterator[MotionFinding]:
 def _gap(part: MovingPart, sweep: Sweep) -> Iterator[MotionFinding]:
     limit = max(GAP * part.size, LEAST_GAP)
     if sweep.rest_gap > limit and not part.is_robot_link:
-        far = (
-            f"at least {format_length(sweep.reach)}"
-            if np.isinf(sweep.rest_gap)
-            else format_length(sweep.rest_gap)
-        )
-        value = None if np.isinf(sweep.rest_gap) else sweep.rest_gap
+        is_near = np.isfinite(sweep.rest_gap)
+        far = format_length(sweep.rest_gap) if is_near else f"at least {format_length(sweep.reach)}"
+        value = sweep.rest_gap if is_near else None
         text = f"is {far} away from everything at rest"
         yield _entry(part, "gap", "suspect", text, value=value, limit=limit, unit="m")
 
 
 def _entering(part: MovingPart, sweep: Sweep, overlap: SweptOverlap) -> MotionFinding:
-    at = overlap.state[part.coordinate]
-    lower, upper = part.limits
     what = f"enters '{overlap.bodies[1]}' by {format_length(overlap.depth)}"
-    is_open = np.isinf(upper) if at > part.home else np.isinf(lower)
     kind = "into_carrier"
-    if is_open:
+    if part.is_unlimited(overlap.state):
         kind, what = "no_limits", f"{what}, as no limit stops it"
-    else:
-        explained = _explain(part, sweep)
-        if explained:
-            kind, what = explained[0], f"{what}; {explained[1]}"
+    elif explained := _explain(part, sweep):
+        kind, what = explained[0], f"{what}; {explained[1]}"
     return _entry(
         part,
         kind,
@@ -294,8 +285,7 @@ def _entering(part: MovingPart, sweep: Sweep, overlap: SweptOverlap) -> MotionFi
 
 def _swallowed(part: MovingPart, sweep: Sweep, body: str, share: float, state: State) -> MotionFinding:
     text = f"turns into '{body}', in whose hull {format_number(100 * share, 2)} % of it end"
-    at = state[part.coordinate]
-    kind = "no_limits" if np.isinf(part.limits[at > part.home]) else "into_carrier"
+    kind = "no_limits" if part.is_unlimited(state) else "into_carrier"
     if kind == "into_carrier" and sweep.find_swallowing_body(mirrored=True) is None:
         kind, text = "flipped_axis", f"{text}; the other way it is free"
     return _entry(
@@ -314,22 +304,22 @@ def _explain(part: MovingPart, sweep: Sweep) -> tuple[str, str] | None:
     across = rotation_along_z(axis.direction)
     for column in (0, 1):
         for sign in (1.0, -1.0):
-            if _is_free_about(part, sweep, sign * across[:, column], axis.point, bool(axis.turn)):
+            if _is_free_about(part, sweep, replace(axis, direction=sign * across[:, column])):
                 return "turned_axis", f"along {_format_direction(sign * across[:, column])} it is free"
     return None
 
 
-def _is_free_about(part: MovingPart, sweep: Sweep, direction: Floats, point: Floats, turns: bool) -> bool:
+def _is_free_about(part: MovingPart, sweep: Sweep, axis: Axis) -> bool:
     """Return True if the part moves freely, and stays near, with another axis, in a model of its own."""
     parts, model = part.parts, Model()
     near = sorted({other for _, other in sweep._rests} | {o for o in sweep.others if o in sweep._own_pairs})
-    lower, upper = part.range
+    values = axis.rate * (np.linspace(*part.range, STATES) - part.home)
     joint: dict[str, Any] = {"name": "q", "parent": "world", "child": "moved"}
-    joint["axis"] = tuple(direction.tolist())
-    joint["origin"] = Pose.from_matrix(transform(np.eye(3), point))
-    place = inverse(transform(np.eye(3), point))
+    joint["axis"] = tuple(axis.direction.tolist())
+    joint["origin"] = Pose.from_matrix(translation(axis.point))
+    place = translation(-axis.point)
     with model.edit() as edit:
-        edit.apply((Revolute if turns else Prismatic)(**joint))
+        edit.apply((Revolute if axis.turn else Prismatic)(**joint))
         for names, parent, before in ((part.solids, "moved", place), (near, "world", np.eye(4))):
             for name in names:
                 kept = tuple(
@@ -343,7 +333,7 @@ def _is_free_about(part: MovingPart, sweep: Sweep, direction: Floats, point: Flo
     ones, others = ([f"body/{name}" for name in names] for names in (part.solids, near))
     query = scene.watch(ones, others, sweep.reach, rules=[_EVERYTHING])
     rest: dict[tuple[int, ...], float] = {}
-    for k, value in enumerate([0.0, *(np.linspace(lower, upper, STATES) - part.home).tolist()]):
+    for k, value in enumerate([0.0, *values.tolist()]):
         scene.update({q: value})
         found = query()
         seen = {
