@@ -20,7 +20,6 @@ import numpy as np
 from kineverse.errors import FormatError
 from kineverse.formats.description import (
     BallJointDescription,
-    JointBounds,
     JointDescription,
     LinkDescription,
     LoopJoint,
@@ -190,7 +189,7 @@ class UsdWriter:
         self.home_poses: dict[str, Matrix] = {WORLD: np.eye(4)}
         joints = description.joints
         self._leaders = {j.symbol: j for j in joints if j.is_independent}
-        self._led = {j.symbol for j in joints if not j.is_independent}
+        self._led = {j.symbol.path for j in joints if not j.is_independent}
 
     def stage(self) -> Any:
         """Return the stage without the document."""
@@ -237,10 +236,11 @@ class UsdWriter:
         if link.is_loose:
             self._api.UsdPhysics.RigidBodyAPI(prim).CreateKinematicEnabledAttr(True)
             return
-        free = self._free_motion(link)
-        if free is not None:
+        free = link.free_motion
+        motion = [f"{free}/{c}" for c in ("x", "y", "z", "qx", "qy", "qz", "qw")]
+        if free and parent.path == self._root.GetPath() and self._led.isdisjoint(motion):
             set_text(prim, FREE, free)
-            home = [self._home[f"{free}/{c}"] for c in ("x", "y", "z", "qx", "qy", "qz", "qw")]
+            home = [self._home[name] for name in motion]
             prim.CreateAttribute(HOME, self._api.Sdf.ValueTypeNames.DoubleArray, True).Set(home)
             return
         if not moves:
@@ -281,28 +281,12 @@ class UsdWriter:
         point = np.array(joint.point)
         return np.asarray(transform(turn, point - turn @ point))
 
-    def _free_motion(self, link: LinkDescription) -> str | None:
-        """Return the name of the free motion of a link in the world; None for any other motion."""
-        if self._carriers[link.parent].path != self._root.GetPath() or len(link.joints) != 4:
-            return None
-        *slides, ball = link.joints
-        if not isinstance(ball, BallJointDescription) or any(ball.point) or ball.dynamics:
-            return None
-        for joint, axis, c in zip(slides, np.eye(3).tolist(), "xyz", strict=True):
-            if not isinstance(joint, JointDescription) or joint.is_rotation or list(joint.axis) != axis:
-                return None
-            if joint.name != f"{ball.name}/{c}" or joint.bounds != JointBounds() or joint.dynamics:
-                return None
-            if joint.symbol in self._led:
-                return None
-        return ball.name
-
     # -- joints ----------------------------------------------------------------------------------------------
 
     def _joints(self, link: LinkDescription, parent: _Carrier) -> None:
         """Add the joints of a link, and bodies in between if one joint does not have its motion."""
-        together = len(link.joints) > 1 and self._generic_axes(link.joints) is not None
-        groups = [link.joints] if together else [[joint] for joint in link.joints]
+        generic = self._generic_axes(link.joints)
+        groups = [[joint] for joint in link.joints] if generic is None else [link.joints]
         carrier, world = parent.at(link.pose), self.home_poses[link.parent] @ link.pose
         for k, joints in enumerate(groups):
             for joint in joints:
@@ -314,8 +298,8 @@ class UsdWriter:
                 prim = self._body_prim(name, world)
                 self._bodies.write(prim, NO_BODY, name, moves=True)
                 child = _Carrier(prim.GetPath(), np.eye(4))
-            if together:
-                self._generic(joints, carrier, child)
+            if generic is not None:
+                self._generic(joints, *generic, carrier, child)
             else:
                 self._single(joints[0], carrier, child)
             carrier = child
@@ -327,12 +311,9 @@ class UsdWriter:
         """
         slides = [j for j in joints if isinstance(j, JointDescription) and not j.is_rotation]
         turns = list(joints[len(slides) :])
-        if (
-            not slides
-            or [*slides, *turns] != list(joints)
-            or len(turns) > 1
-            or any(map(self._is_alone, joints))
-        ):
+        if not slides or len(joints) == 1 or len(turns) > 1 or list(joints[: len(slides)]) != slides:
+            return None
+        if any(map(self._is_alone, joints)):
             return None
         axes = [np.array(joint.axis) for joint in slides]
         turn = turns[0] if turns else None
@@ -363,7 +344,7 @@ class UsdWriter:
         """Return True if a joint has to have one degree of freedom: Newton's schemas are about all."""
         if isinstance(joint, BallJointDescription):
             return False
-        is_coupled = not joint.is_independent or joint.symbol in self._led
+        is_coupled = not joint.is_independent or joint.symbol.path in self._led
         return (
             is_coupled
             or joint.bounds.max_velocity < math.inf
@@ -394,10 +375,14 @@ class UsdWriter:
         if passive:
             self._newton(made.GetPrim(), "NewtonJointAPI", **passive)
 
-    def _generic(self, joints: Sequence[_Joint], parent: _Carrier, child: _Carrier) -> None:
-        found = self._generic_axes(joints)
-        assert found is not None
-        rotation, freedoms = found
+    def _generic(
+        self,
+        joints: Sequence[_Joint],
+        rotation: Matrix,
+        freedoms: Mapping[str, _Joint],
+        parent: _Carrier,
+        child: _Carrier,
+    ) -> None:
         last = joints[-1]
         turns = isinstance(last, BallJointDescription) or last.is_rotation
         point = np.array(last.point) if turns else np.zeros(3)
