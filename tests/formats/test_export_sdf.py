@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from random_trees import KINDS, trees
-from round_trip import SCENES, SHIPPED, assert_same_bodies, assert_same_motion, load_cached
+from round_trip import CURVES, SCENES, SHIPPED, assert_same_bodies, assert_same_motion, load_cached
 from test_export_names import NAMES, named
 from test_export_urdf import REFUSED
 
@@ -25,7 +25,6 @@ from kineverse.model.body import Body, Box, Capsule, Cone, Ellipsoid, Inertia, M
 pytest.importorskip("pydrake")
 
 LOOPS = ("slider_crank", "four_bar", "parallel_gripper", "scissor_linkage", "delta_robot", "jansen_leg")
-CURVES = ("cam", "mimic", "ackermann", "garage_door_as_published", "folding_door", "piston", "pedal_bin")
 
 
 def saved(model: kv.Model, folder: Path) -> kv.Model:

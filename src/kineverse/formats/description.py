@@ -76,6 +76,9 @@ class BallJointDescription:
     dynamics: Mapping[str, Any] = field(default_factory=dict)
 
 
+_SPACE = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
+
+
 @dataclass
 class LinkDescription:
     """Link of a robot description: its pose in its parent, and the joints that move it from there."""
@@ -89,6 +92,23 @@ class LinkDescription:
     is_articulation: bool = False  # True if an articulation of the model has that name
     dynamics: Mapping[str, Any] = field(default_factory=dict)
     is_loose: bool = False  # True if it moves as no joint of the format; the pose is that at home
+
+    @property
+    def free_motion(self) -> str:
+        """Name of its motion if it moves freely in its parent, ``name/x`` … ``name/qw``; else empty."""
+        if len(self.joints) != 4:
+            return ""
+        *slides, ball = self.joints
+        if not isinstance(ball, BallJointDescription) or any(ball.point) or ball.dynamics:
+            return ""
+        for joint, (c, axis) in zip(slides, _SPACE.items(), strict=True):
+            if not isinstance(joint, JointDescription) or joint.is_rotation or joint.axis != axis:
+                return ""
+            if joint.name != f"{ball.name}/{c}" or not joint.is_independent or joint.dynamics:
+                return ""
+            if joint.bounds != JointBounds():
+                return ""
+        return ball.name
 
 
 @dataclass(frozen=True)

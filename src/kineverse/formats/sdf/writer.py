@@ -241,22 +241,13 @@ class SdfWriter:
 
     def _free_name(self, link: LinkDescription) -> str | None:
         """Return the name of the free motion of a link in the world; None if it has no such motion."""
-        if link.parent != WORLD or len(link.joints) != 4:
+        free = link.free_motion
+        if link.parent != WORLD or not free:
             return None
-        *slides, ball = link.joints
-        if not isinstance(ball, BallJointDescription) or any(ball.point) or ball.dynamics:
-            return None
-        for joint, (c, axis) in zip(slides, _SPACE.items(), strict=True):
-            if not isinstance(joint, JointDescription) or joint.is_rotation or joint.axis != axis:
-                return None
-            if joint.name != f"{ball.name}/{c}" or not joint.is_independent or joint.dynamics:
-                return None
-            if joint.bounds != JointBounds():
-                return None
-        coordinates = {f"{ball.name}/{c}" for c in _SPACE}
+        coordinates = {f"{free}/{c}" for c in _SPACE}
         followers = {j.symbol.path for j in self._description.joints if not j.is_independent}
         is_coupled = not coordinates.isdisjoint(followers) or not coordinates.isdisjoint(self._looped)
-        return None if is_coupled else ball.name
+        return None if is_coupled else free
 
     def _free_link(self, link: LinkDescription, free: str) -> None:
         values = [self._home.get(f"{free}/{c}", 0.0) for c in (*_SPACE, *_QUATERNION)]
