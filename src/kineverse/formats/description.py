@@ -20,6 +20,7 @@ Matrix: TypeAlias = npt.NDArray[np.float64]
 Coefficients: TypeAlias = tuple[float, ...]  # coefficients of the powers of a coordinate, constant first
 
 IDENTITY_COEFFICIENTS: Coefficients = (0.0, 1.0)
+_SPACE = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 
 
 def dynamics_number(dynamics: Mapping[str, Any], key: str) -> float | None:
@@ -41,6 +42,11 @@ class JointBounds:
     min_velocity: float = -math.inf
     max_velocity: float = math.inf
     soft: tuple[float, float] | None = None
+
+    @property
+    def home(self) -> float:
+        """Position at which a joint without a stated home begins: the one nearest to 0."""
+        return min(max(0.0, self.lower), self.upper)
 
     @property
     def is_unbounded(self) -> bool:
@@ -74,9 +80,6 @@ class BallJointDescription:
     name: str
     point: Vector3
     dynamics: Mapping[str, Any] = field(default_factory=dict)
-
-
-_SPACE = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 
 
 @dataclass
@@ -158,6 +161,11 @@ class RobotDescription:
     def joints(self) -> list[JointDescription]:
         """All rotational and translational joints."""
         return [joint for link in self.links for joint in link.joints if isinstance(joint, JointDescription)]
+
+    def has_followers(self, link: LinkDescription) -> bool:
+        """Return whether another joint follows one of a link: then each of these has to be a joint."""
+        own = {joint.name for joint in link.joints}
+        return any(joint.symbol.path in own for joint in self.joints if not joint.is_independent)
 
 
 @dataclass(frozen=True)
