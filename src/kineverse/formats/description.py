@@ -99,8 +99,10 @@ class LinkDescription:
     @property
     def free_motion(self) -> str:
         """Name of the free motion that its joints are: slides along x, y, z and a ball; empty for others."""
-        *slides, ball = self.joints or [None]
-        if not isinstance(ball, BallJointDescription) or len(slides) != 3 or any(ball.point) or ball.dynamics:
+        if len(self.joints) != 4:
+            return ""
+        *slides, ball = self.joints
+        if not isinstance(ball, BallJointDescription) or any(ball.point) or ball.dynamics:
             return ""
         for joint, (c, axis) in zip(slides, _SPACE.items(), strict=True):
             if not isinstance(joint, JointDescription) or joint.is_rotation or joint.axis != axis:
