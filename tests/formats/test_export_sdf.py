@@ -251,7 +251,7 @@ def test_bodies_are_those_of_the_model(tmp_path: Path) -> None:
     assert ElementTree.parse(tmp_path / "m.sdf").getroot().get("version") == "1.12"
     remarks = model.save(tmp_path / "m.sdf").remarks
     assert any("the inertia of 'a' is that of no body" in remark for remark in remarks)
-    assert "SDF has no links without mass: b, c, d weigh 0.001 kg" in remarks
+    assert "SDF has no links without mass; 0.001 kg is written for b, c, d" in remarks
 
 
 def test_dynamics_and_limits_are_written_or_told(tmp_path: Path) -> None:

@@ -44,8 +44,8 @@ cannot read are converted, into a folder beside OUT; missing ones are left out o
 With --check, an engine of the format reads OUT on its own: pinocchio a URDF, MuJoCo an MJCF, drake an SDF,
 OpenUSD a USD. In 100 states within limits, the poses of all frames in OUT are compared with those of IN. If
 one differs by more than 1e-9 m or rad (1e-6 in USD; an approximated one by more than its bound), the joint is
-named and the status is 1; OUT is kept. To compare IN and OUT by Kineverse alone: kineverse diff IN OUT
---values
+named and the status is 1. If the engine cannot read OUT, the status is 2. OUT is kept in both cases. To
+compare IN and OUT by Kineverse alone: kineverse diff IN OUT --values
 
 examples:
   kineverse convert robot.sdf robot.urdf

@@ -71,7 +71,7 @@ def check_conversion(
     states: int = STATES,
     bounds: Mapping[str, FrameDeviation] | None = None,
 ) -> ConversionCheck:
-    """Compare the poses of all frames of a model with those of a file, in an engine of its own.
+    """Compare the poses of all frames of a model with those of a file written from it, in another engine.
 
     The engine is pinocchio for URDF, MuJoCo for MJCF and drake for SDF. It reads the file with its own
     parser, and gets the values of all coordinates in each state, of dependent ones as well. OpenUSD reads
@@ -92,7 +92,7 @@ def check_conversion(
     MissingDependencyError
         If the engine is not installed, with the command that installs it.
     FormatError
-        If the engine does not read the file, or if a frame is missing there.
+        If the engine does not read the file, if it lacks a frame, or if it has a joint that the model lacks.
     """
     states = as_count("states", states, 1)
     engine = find_engine(path)(Path(path))

@@ -239,9 +239,8 @@ class DrakeEngine(PoseEngine):
         self._plant = plants.MultibodyPlant(0.0)
         with _without_logging():
             try:
-                (instance,) = Parser(self._plant).AddModelsFromString(
-                    ElementTree.tostring(root, "unicode"), "sdf"
-                )
+                text = ElementTree.tostring(root, "unicode")
+                instance = Parser(self._plant).AddModelsFromString(text, "sdf")[0]
                 self._plant.Finalize()
             except (RuntimeError, ValueError) as error:
                 raise self.refuse(error) from None
@@ -252,13 +251,11 @@ class DrakeEngine(PoseEngine):
         self._by_name = {part.get("name", ""): find(part.get("name", ""), instance) for part in names}
         self._frames = {_given(part, NAME) or part.get("name", ""): part.get("name", "") for part in names}
         self.frames = list(self._frames)
-        self._starts = {n: self._joint(n, instance).position_start() for n in self._joints}
+        joint = self._plant.GetJointByName
+        self._starts = {name: joint(name, instance).position_start() for name in self._joints}
         self._start = self._plant.GetPositions(self._context).copy()
         self._free = [link for link in model.findall("link") if _given(link, FREE)]
         self._free_poses = {link.get("name", ""): self._pose(link.get("name", "")) for link in self._free}
-
-    def _joint(self, name: str, instance: Any) -> Any:
-        return self._plant.GetJointByName(name, instance)
 
     def _pose(self, name: str) -> Array:
         pose: Array = self._by_name[name].CalcPoseInWorld(self._context).GetAsMatrix4()

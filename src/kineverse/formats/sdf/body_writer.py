@@ -60,7 +60,8 @@ class SdfBodyWriter:
     def finish(self) -> None:
         """Add the remark on links that have no mass in the model."""
         if self._massless:
-            self._remark(f"SDF has no links without mass: {list_some(self._massless, 4)} weigh {_MASS:g} kg")
+            links = list_some(self._massless, 4)
+            self._remark(f"SDF has no links without mass; {_MASS:g} kg is written for {links}")
 
     def _inertia(self, link: Tag, inertia: Inertia | None, name: str) -> None:
         element = link.add("inertial")
