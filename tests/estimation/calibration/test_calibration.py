@@ -111,8 +111,8 @@ def check_statistics(seeds: range, bad: float, most: float, nees: tuple[float, f
 
 @pytest.mark.parametrize("bad", [0.0, 0.1])
 def test_errors_are_near_the_bound_and_of_the_stated_size(bad: float) -> None:
-    # 6 draws of 13 errors: standard deviations are 8 % of the RMSE and 16 % of the NEES.
-    check_statistics(range(100, 106), bad, 1.2, (0.6, 1.45))
+    # 4 draws of 13 errors: standard deviations are 10 % of the RMSE and 20 % of the NEES.
+    check_statistics(range(100, 104), bad, 1.25, (0.5, 1.55))
 
 
 @pytest.mark.long
@@ -373,7 +373,7 @@ def test_the_same_structure_is_compiled_once(monkeypatch: pytest.MonkeyPatch) ->
 # -- refusals --------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("count", [6, 20, 60])
+@pytest.mark.parametrize("count", [6, 12, 60])
 @pytest.mark.parametrize("free", [FREE, ["mount camera", PALM_MOUNT]], ids=["arm", "mounts"])
 @pytest.mark.parametrize("noise", [None, NOISE], ids=["unknown", "known"])
 def test_gross_errors_alone_are_refused(count: int, free: list[str], noise: Any) -> None:

@@ -514,7 +514,8 @@ def make_block(kernel: Kernel, rows: Sequence[ObservedRow], states: Mapping[int,
                 f"'{row.label}' depends on. Its state has {list_some(map(repr, map(str, state)), 6)}."
             ) from None
     inputs[:, inputs.shape[1] - kernel.data :] = _stack(rows)
-    covariance = None if first.covariance is None else np.stack([_covariance(row) for row in rows])
+    # Rows with and without a covariance are in different blocks.
+    covariance = None if first.covariance is None else np.array([row.covariance for row in rows])
     looks = np.array([row.look for row in rows])
     wrong = np.flatnonzero(~np.isfinite(inputs).all(axis=1))
     if len(wrong):
@@ -534,8 +535,3 @@ def _stack(rows: Sequence[ObservedRow]) -> Array:
             part = f"observation '{row.label}' in look {row.look}"
             check_rigid(row.data[None], part) if is_pose else check_finite(row.data[None], part, "Value")
     return np.asarray(orthonormalize(seen))[:, :3].reshape(-1, 12) if is_pose else seen
-
-
-def _covariance(row: ObservedRow) -> Array:
-    assert row.covariance is not None  # rows with and without one are in different blocks
-    return row.covariance
