@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import math
+from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -166,7 +167,10 @@ def run(arguments: argparse.Namespace) -> int:
         )
     except KineverseError as error:
         raise type(error)(
-            str(error).replace("state=", "--set NAME=VALUE").replace("focal=", "--intrinsics")
+            str(error)
+            .replace("state=", "--set NAME=VALUE")
+            .replace("focal=", "--intrinsics")
+            .replace("relative_to=", "--in")
         ) from None
     if table.assumptions:
         print_notes([f"assumed: {'; '.join(table.assumptions)}"])
@@ -237,8 +241,6 @@ def _complete(model: kv.Model, text: str, camera: _Camera) -> list[str | Symbol]
 
 
 def _matches(names: Sequence[str], pattern: str) -> bool:
-    from fnmatch import fnmatchcase
-
     return any(fnmatchcase(name, pattern) for name in names)
 
 
@@ -259,11 +261,15 @@ def _attach_frames(model: kv.Model, texts: Sequence[str]) -> None:
             name, sign, parent = (part.strip() for part in text.partition("="))
             if not sign or not name or not parent:
                 raise InvalidValueError(f"--attach {text!r}: write NAME=PARENT, such as marker=hand")
-            frames = ("world", *model.frames)
+            frames = ("world", *edit.model.frames)
             ends = [parent] if parent in frames else [f for f in frames if f.endswith(f"/{parent}")]
             if len(ends) != 1:
                 hint = suggest(parent, frames, "frame")
                 raise UnknownNameError(f"--attach {text}: the model has no frame '{parent}'. {hint}")
+            if name in frames:
+                raise InvalidValueError(
+                    f"--attach {text}: there is a frame '{name}' already. Choose another name."
+                )
             edit.add_frame(name, parent=ends[0])
 
 
@@ -304,11 +310,13 @@ def _format(
     rows = []
     for symbol, value in found.state.items():
         name = str(symbol)
-        unit = found.units[name]
+        unit = found.units[name]  # only intrinsics have none
         number, shown = _scaled(value, unit)
         deviation = found.deviations[name]
         spread = "not told alone" if math.isinf(deviation) else format_number(_scaled(deviation, unit)[0], 2)
-        rows.append([name, format_number(number, 4), f"± {spread}", shown or "px" * (name[:7] == "camera/")])
+        rows.append(
+            [name, format_number(number, 4), f"± {spread}", shown or "px"]
+        )  # only intrinsics have none
     lines.append(format_table(["parameter", "correction", "deviation", "unit"], rows, "<>><"))
     lines.append("")
     groups = list(found.noise)
