@@ -430,7 +430,7 @@ class OdometryBlock:
         """Divide the drive into pieces without slip, and mark gross errors.
 
         The motion from a pose to the next one, which neither the start nor earlier slips change, is fitted
-        first, with Cauchy weights. A pose that does not fit to the last good one is a gross error; several in
+        first, with Cauchy weights. A pose that does not fit the last good one is a gross error; several in
         succession that fit each other are good ones after a slip. Slips that are too small for this are found
         by the likelihood ratio of a further start, over all poses of a piece.
         """
