@@ -218,7 +218,7 @@ def test_pixels_and_intrinsics(run, arm, tmp_path):
     rows = np.concatenate([values[good], pixels], axis=1)
     path = tmp_path / "corners.csv"
     path.write_text(
-        "\n".join([",".join([*JOINTS, "u", "v"]), *(",".join(map(repr, row)) for row in rows.tolist())])
+        "\n".join([",".join([*JOINTS, "u [px]", "v"]), *(",".join(map(repr, row)) for row in rows.tolist())])
     )
     rpy = " ".join(map(repr, CAMERA[1].as_euler("xyz").tolist()))
     joint = (
@@ -254,7 +254,9 @@ def wrong(arm, tmp_path, **change):
         (("--free", "mount camra", "--attach", "camera=world", *SEEN), "'camra'.*'camera'"),
         (("--free", "offsets *"), "does not say which frame was seen.*--observed"),
         (("--free", "offsets *", "--observed", "tp"), "'tp' is no frame of the model.*'tip'"),
-        (("--free", "offsets *", "--observed", "tip", "--in", "camera"), "'camera' is no frame"),
+        (("--free", "offsets *", "--observed", "tip", "--in", "camera"), "--in 'camera' is no frame"),
+        (("--free", "offsets *", "--observed", "tip", "--set", "pan=1"), "'pan' has a column, so --set"),
+        (("--free", "offsets *", "--observed", "tip", "--attach", "tip=hand"), "a frame 'tip' already"),
         (("--free", "offsets *", "--observed", "tip", "--noise", "x"), "--noise 'x'"),
         (("--free", "offsets *", "--observed", "tip", "--attach", "a"), "write NAME=PARENT"),
         (("--free", "offsets *", "--observed", "tip", "--attach", "a=b"), "no frame 'b'"),
@@ -295,7 +297,9 @@ def test_wrong_tables(run, arm, tmp_path):
     assert re.search("turns as the joints do if its quaternions are w, x, y, z.*--columns", notes)
     notes = said(values, poses, names=("pan", "lift", "roll", "reach", "pan"))
     assert "are both values of 'pan'" in notes
-    assert "unit 'ells'" in said(values, poses, names=("pan [ells]", *JOINTS[1:]))
+    assert "unit 'mm', but 'pan' is in rad or deg" in said(values, poses, names=("pan [mm]", *JOINTS[1:]))
+    names = (*JOINTS[:3], "reach [deg]", "wrist")
+    assert "unit 'deg', but 'reach' is in m, cm or mm" in said(values, poses, names=names)
     values = values.astype(object)
     values[2, 1] = "up"
     assert re.search("line 4: lift is 'up', which is no number", said(values, poses))

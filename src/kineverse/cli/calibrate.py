@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import math
-from pathlib import Path
+from fnmatch import filter as filter_names
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -166,28 +166,25 @@ def run(arguments: argparse.Namespace) -> int:
         )
     except KineverseError as error:
         raise type(error)(
-            str(error).replace("state=", "--set NAME=VALUE").replace("focal=", "--intrinsics")
+            str(error)
+            .replace("state=", "--set NAME=VALUE")
+            .replace("focal=", "--intrinsics")
+            .replace("relative_to=", "--in")
         ) from None
-    if table.assumptions:
-        print_notes([f"assumed: {'; '.join(table.assumptions)}"])
-    print_notes(table.remarks)
-    if table.ignored:
-        print_notes([f"columns that mean nothing here: {', '.join(table.ignored)}"])
+    assumed = [f"assumed: {'; '.join(table.assumptions)}"] if table.assumptions else []
+    ignored = [f"columns that mean nothing here: {', '.join(table.ignored)}"] if table.ignored else []
+    print_notes([*assumed, *table.remarks, *ignored])
     with show_activity(f"calibrating by {len(table.looks)} looks"):
         found = calibrate(model, table.looks, free, noise=noise, held_out=arguments.held_out)
-    saved = _save(found, arguments.output)
+    saved = None
+    if arguments.output:
+        with show_activity(f"writing {arguments.output}"):
+            saved = found.save(arguments.output)
     if arguments.json:
         print(json.dumps(_as_json(arguments, table, found, saved), allow_nan=False))
     else:
         print("\n".join(_format(arguments, model, table, found, saved)))
     return UNTOLD if found.unobservable else 0
-
-
-def _save(found: Calibration, target: str | None) -> SaveResult | None:
-    if not target:
-        return None
-    with show_activity(f"writing {target}"):
-        return found.save(target)
 
 
 # -- options -------------------------------------------------------------------------------------------------
@@ -226,20 +223,12 @@ def _complete(model: kv.Model, text: str, camera: _Camera) -> list[str | Symbol]
                 "600,600,320,240"
             )
         return [*camera.symbols]
-    names = [*model.articulations, *model.frames]
-    pattern = pattern.strip()
+    names, pattern = [*model.articulations, *model.frames], pattern.strip()
+    if not pattern or filter_names(names, pattern):
+        return [text]
     prefixes = sorted({name.partition("/")[0] for name in names if "/" in name})
-    if pattern and not _matches(names, pattern):
-        longer = [f"{prefix}/{pattern}" for prefix in prefixes if _matches(names, f"{prefix}/{pattern}")]
-        if longer:
-            return [f"{word} {one}" for one in longer]
-    return [text]
-
-
-def _matches(names: Sequence[str], pattern: str) -> bool:
-    from fnmatch import fnmatchcase
-
-    return any(fnmatchcase(name, pattern) for name in names)
+    longer = [f"{prefix}/{pattern}" for prefix in prefixes]
+    return [f"{word} {one}" for one in longer if filter_names(names, one)] or [text]
 
 
 def _coordinate(model: kv.Model, name: str) -> Symbol:
@@ -259,11 +248,15 @@ def _attach_frames(model: kv.Model, texts: Sequence[str]) -> None:
             name, sign, parent = (part.strip() for part in text.partition("="))
             if not sign or not name or not parent:
                 raise InvalidValueError(f"--attach {text!r}: write NAME=PARENT, such as marker=hand")
-            frames = ("world", *model.frames)
+            frames = ("world", *edit.model.frames)
             ends = [parent] if parent in frames else [f for f in frames if f.endswith(f"/{parent}")]
             if len(ends) != 1:
                 hint = suggest(parent, frames, "frame")
                 raise UnknownNameError(f"--attach {text}: the model has no frame '{parent}'. {hint}")
+            if name in frames:
+                raise InvalidValueError(
+                    f"--attach {text}: there is a frame '{name}' already. Choose another."
+                )
             edit.add_frame(name, parent=ends[0])
 
 
@@ -304,11 +297,13 @@ def _format(
     rows = []
     for symbol, value in found.state.items():
         name = str(symbol)
-        unit = found.units[name]
+        unit = found.units[name]  # only intrinsics have none
         number, shown = _scaled(value, unit)
         deviation = found.deviations[name]
         spread = "not told alone" if math.isinf(deviation) else format_number(_scaled(deviation, unit)[0], 2)
-        rows.append([name, format_number(number, 4), f"± {spread}", shown or "px" * (name[:7] == "camera/")])
+        rows.append(
+            [name, format_number(number, 4), f"± {spread}", shown or "px"]
+        )  # only intrinsics have none
     lines.append(format_table(["parameter", "correction", "deviation", "unit"], rows, "<>><"))
     lines.append("")
     groups = list(found.noise)
@@ -339,7 +334,6 @@ def _format(
 def _as_json(
     arguments: argparse.Namespace, table: LookTable, found: Calibration, saved: SaveResult | None
 ) -> dict[str, Any]:
-    finite = {n: None if math.isinf(d) else d for n, d in found.deviations.items()}
     return {
         "model": arguments.model,
         "data": arguments.data,
@@ -347,7 +341,7 @@ def _as_json(
         "assumptions": list(table.assumptions),
         "ignored": list(table.ignored),
         "state": {str(s): float(v) for s, v in found.state.items()},
-        "deviations": finite,
+        "deviations": {n: None if math.isinf(d) else d for n, d in found.deviations.items()},
         "units": dict(found.units),
         "covariance": np.asarray(found.covariance).tolist(),
         "unobservable": [dict(direction) for direction in found.unobservable],
@@ -358,6 +352,6 @@ def _as_json(
             {"line": table.lines[o.look], "what": o.what, "probability": o.probability}
             for o in found.outliers
         ],
-        "output": None if saved is None else str(Path(saved.path)),
+        "output": None if saved is None else str(saved.path),
         "remarks": [] if saved is None else list(saved.remarks),
     }

@@ -105,9 +105,8 @@ HEAD = ("head_pan", "head_tilt")
 _JOINTS = (*(f"r_{n}_joint" for n in ARM), *(f"{n}_joint" for n in HEAD))
 _LOWER = np.array([-1.5, -0.4, -2.0, -2.0, -2.0, -1.8, -2.0, -0.6, 0.1])
 _UPPER = np.array([0.4, 0.8, 0.5, -0.3, 2.0, -0.2, 2.0, 0.6, 0.9])
-_NOMINAL = transform(
-    rpy(np.array([-math.pi / 2, 0.0, -math.pi / 2])), np.array([0.07, 0.0, 0.1])
-)  # of the camera
+# Of the camera in the head.
+_NOMINAL = transform(rpy(np.array([-math.pi / 2, 0.0, -math.pi / 2])), np.array([0.07, 0.0, 0.1]))
 _CORNERS = 0.05 * np.array([[1.0, 1.0, 0.0], [1.0, -1.0, 0.0], [-1.0, -1.0, 0.0], [-1.0, 1.0, 0.0]])  # [m]
 
 
@@ -257,11 +256,8 @@ def calibrate_camera(model: kv.Model, arm: SeenArm, seed: int) -> Draw:
 # -- a base on wheels ----------------------------------------------------------------------------------------
 
 _WHEELS = np.array([0.06, 0.06, 0.3748])  # radii and track of the shipped Fetch [m]
-_SECONDS, _READING, _SEEN = (
-    180.0,
-    0.02,
-    2.0,
-)  # of a drive, between readings of the wheels, and between poses [s]
+_SECONDS = 180.0  # of a drive
+_READING, _SEEN = 0.02, 2.0  # between readings of the wheels, and between poses [s]
 _PLANE = np.array([POSITION, POSITION, ORIENTATION])
 
 

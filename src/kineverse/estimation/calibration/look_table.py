@@ -142,6 +142,11 @@ class _LookReader:
     ) -> LookTable:
         """Return the looks."""
         joints, pixels, rest = self._sort_columns()
+        twice = [name for name in map(str, joints) if name in {*map(str, state)}]
+        if twice:
+            raise FormatError(
+                f"{self.table.source}: '{twice[0]}' has a column, so state= cannot give its value as well."
+            )
         reference = None if relative_to is None else self._frame(relative_to, "relative_to=")
         observations: list[list[tuple[Any, Any] | ObservedPixel]] = [[] for _ in self.table.cells]
         ignored: tuple[str, ...] = ()
@@ -260,7 +265,7 @@ class _LookReader:
             misfits = []
             for reading in readings:
                 tracks = self._named(reading, observed, reference)
-                values = {s: self._numbers(k)[0] for s, k in joints.items()}
+                values = {s: self._numbers(k, self._quantity(s))[0] for s, k in joints.items()}
                 misfits.append(self._misfit(tracks, values, state))
             best = int(np.argmin(misfits))
             if not misfits[1 - best] > _DECISIVE * misfits[best]:
@@ -283,8 +288,8 @@ class _LookReader:
         for name, track in recording.tracks.items():
             if not name and observed is None:
                 raise FormatError(
-                    f"{self.table.source} does not say which frame was seen: name it by observed= , and the "
-                    "one that it was seen in by relative_to= , if that is not the world."
+                    f"{self.table.source} does not say which frame was seen. Name it by observed=, and the "
+                    "one that it was seen in by relative_to=, if that is not the world."
                 )
             frame = self._frame(observed if observed and len(recording.tracks) == 1 else name, "The part")
             seen_in = reference or (self._frame(track.frame, "The frame_id") if track.frame else WORLD)
@@ -293,7 +298,7 @@ class _LookReader:
 
     # -- joint values ----------------------------------------------------------------------------------------
 
-    def _numbers(self, column: int) -> tuple[Array, bool]:
+    def _numbers(self, column: int, quantity: str) -> tuple[Array, bool]:
         """Return the values of a column in SI units, NaN for empty cells, and True if its unit is stated."""
         name, unit = self._split_unit(self.names[column])
         cells = self.table.cells[:, column]
@@ -304,11 +309,12 @@ class _LookReader:
                     "is no number."
                 )
         values = np.array([float(text) if text else math.nan for text in cells])
-        factors = {**UNITS["length"], **UNITS["angle"]}
+        factors = {"px": 1.0} if quantity == "pixel" else UNITS[quantity]
         if unit and unit.lower() not in factors:
+            known = {"pixel": "px", "angle": "rad or deg"}.get(quantity, "m, cm or mm")
             raise FormatError(
-                f"{self.table.source}: the column '{self.names[column]}' has the unit '{unit}'. Known are "
-                "rad, deg, m, cm and mm."
+                f"{self.table.source}: the column '{self.names[column]}' has the unit '{unit}', but '{name}' "
+                f"is in {known}."
             )
         return values * factors.get(unit.lower(), 1.0), bool(unit)
 
@@ -323,14 +329,12 @@ class _LookReader:
         open_angles: list[Symbol] = []
         given = parse_units(self.units)
         for symbol, column in joints.items():
-            values[symbol], stated = self._numbers(column)
-            turns = self._is_angle(symbol)
-            if not stated and turns and "angle" in given:
-                values[symbol] = values[symbol] * given["angle"]
-            elif not stated and turns:
+            quantity = self._quantity(symbol)
+            values[symbol], stated = self._numbers(column, quantity)
+            if not stated and quantity in given:
+                values[symbol] = values[symbol] * given[quantity]
+            elif not stated and quantity == "angle":
                 open_angles.append(symbol)
-            elif not stated and not turns and "length" in given:
-                values[symbol] = values[symbol] * given["length"]
         whole = np.isfinite(np.stack([*values.values()])).all(axis=0)
         lost = int((~whole).sum())
         if lost:
@@ -343,13 +347,13 @@ class _LookReader:
             values |= {symbol: np.radians(values[symbol]) for symbol in open_angles}
         return values, rows
 
-    def _is_angle(self, symbol: Symbol) -> bool:
-        """Return True for a coordinate about which something turns."""
+    def _quantity(self, symbol: Symbol) -> str:
+        """Return "angle" for a coordinate by which something turns, else "length"."""
         for one in self.model.articulations.values():
             if symbol in one.coordinates:
                 pose = self.model.fk(one.child, relative_to=one.parent)
-                return symbol in pose[:3, :3].symbols
-        return True
+                return "angle" if symbol in pose[:3, :3].symbols else "length"
+        return "angle"
 
     def _are_degrees(
         self,
@@ -475,7 +479,7 @@ class _LookReader:
                 f"focal length: {', '.join(missing)} is missing."
             )
         frame = self._frame(frame, "The part")
-        u, v = (self._numbers(places[axis])[0] for axis in "uv")
+        u, v = (self._numbers(places[axis], "pixel")[0] for axis in "uv")
         for row in np.flatnonzero(np.isfinite(u) & np.isfinite(v)).tolist():
             pixel = float(u[row]), float(v[row])
             observations[row].append(ObservedPixel(frame, camera, pixel, focal=focal, centre=centre))

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
+from kineverse._checks import finite_number
 from kineverse.compilation import compile
 from kineverse.errors import InvalidValueError, ShapeError, UnknownNameError, list_some, suggest
 from kineverse.estimation.noise import CHI_SQUARED_6, Outliers, check_covariance, check_rigid
@@ -94,8 +95,12 @@ class WheelOdometry:
         ------
         InvalidValueError, ShapeError, UnknownNameError
             For a base that does not move by speeds, readings that are missing, of another length or not
-            finite, and poses outside of the times of the readings.
+            finite or without full turns, and poses outside of the times of the readings.
         """
+        if self.restart is not None and not (finite_number(self.restart) or 0.0) > 0.0:
+            raise InvalidValueError(
+                f"The drive of '{self.base}': restart= is a time above 0 s, not {self.restart!r:.40}."
+            )
         return OdometryBlock(self, model, _find_base(model, self.base), tuple(free), look)
 
 
@@ -148,6 +153,12 @@ class _Readings:
                 f"read from {times[0]:.6g} s to {times[-1]:.6g} s. Leave out the poses before and after."
             )
         series = {str(name): _series(f"{what}: '{name}'", v, len(times)) for name, v in given.wheels.items()}
+        wrapped = next((name for name, values in series.items() if _is_wrapped(values)), None)
+        if wrapped is not None:
+            raise InvalidValueError(
+                f"{what}: '{wrapped}' begins anew after each full turn. Count the turns on, as "
+                "numpy.unwrap does."
+            )
         merged = np.union1d(times, seen_at)
         steps = {name: np.interp(merged, times, values) for name, values in series.items()}
         paths = {speed: speed.position.path for speed in record.speeds}
@@ -164,6 +175,13 @@ class _Readings:
         increments = np.stack([np.diff(steps[paths[s]]) for s in record.speeds], axis=1)
         middles = {c: (steps[c.path][1:] + steps[c.path][:-1]) / 2 for c in record.coordinates[3:]}
         return cls(increments, record.speeds, middles, np.searchsorted(merged, seen_at), seen_at)
+
+
+def _is_wrapped(values: Array) -> bool:
+    """Return True for angles within one turn that jump back by more than a half against their motion."""
+    steps = np.diff(values)
+    back = (np.abs(steps[1:]) > math.pi) & (steps[1:] * steps[:-1] < 0.0)
+    return bool(back.any()) and float(np.ptp(values)) <= math.tau
 
 
 def _series(what: str, given: npt.ArrayLike, length: int | None = None) -> Array:
@@ -412,7 +430,7 @@ class OdometryBlock:
         """Divide the drive into pieces without slip, and mark gross errors.
 
         The motion from a pose to the next one, which neither the start nor earlier slips change, is fitted
-        first, with Cauchy weights. A pose that does not fit to the last good one is a gross error; several in
+        first, with Cauchy weights. A pose that does not fit the last good one is a gross error; several in
         succession that fit each other are good ones after a slip. Slips that are too small for this are found
         by the likelihood ratio of a further start, over all poses of a piece.
         """
