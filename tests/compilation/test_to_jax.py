@@ -40,7 +40,6 @@ jax = pytest.importorskip("jax")
 jnp = jax.numpy
 
 TIERS = [pytest.param("c", marks=pytest.mark.compiler), "operations"]
-LONG = {name: [pytest.mark.long] for name in ("powers", "augmented", "four_bar", "folding_door", "robot_arm")}
 
 
 @pytest.fixture(autouse=True)
@@ -51,15 +50,9 @@ def doubles() -> Iterator[None]:
     jax.config.update("jax_enable_x64", before)
 
 
+@pytest.mark.parametrize("tier", TIERS)
 @pytest.mark.parametrize(
-    ("name", "tier"),
-    [
-        *(pytest.param(name, "c", marks=[pytest.mark.compiler, *LONG.get(name, [])]) for name in CASES),
-        *(
-            pytest.param(name, "operations", marks=[] if name == "kinks" else pytest.mark.long)
-            for name in CASES
-        ),
-    ],
+    "name", [pytest.param(name, marks=[] if name == "kinks" else pytest.mark.long) for name in CASES]
 )
 def test_values_and_derivatives_are_those_of_the_library(name: str, tier: Any) -> None:
     case = CASES[name]()
@@ -259,10 +252,35 @@ def test_large_arrays_on_one_core_do_not_wait_for_each_other() -> None:
         "for i in range(5): total = g(jnp.full((150_000, 2), 0.1 * i))\n"
         "print(total)"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, encoding="utf-8", timeout=300, check=True
+    assert np.isfinite(float(run_alone(program)))
+
+
+@pytest.mark.long
+@pytest.mark.compiler
+def test_each_device_computes_its_part_of_a_sharded_array(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XLA_FLAGS", "--xla_force_host_platform_device_count=3")
+    program = (
+        "import jax, numpy as np, kineverse as kv\n"
+        "a, b = kv.position('a'), kv.position('b')\n"
+        "f = kv.to_jax(kv.rotation_z(a) * b, [a, b], tier='c')\n"
+        "devices = jax.sharding.Mesh(jax.devices(), ('i',))\n"
+        "part = jax.sharding.PartitionSpec('i')\n"
+        "x = np.random.default_rng(0).random((3000, 2), dtype=np.float32)\n"
+        "g = jax.jit(jax.shard_map(f, mesh=devices, in_specs=part, out_specs=part))\n"
+        "y = jax.device_put(x, jax.sharding.NamedSharding(devices, part))\n"
+        "found = g(y)\n"
+        "assert {s.data.shape for s in found.addressable_shards} == {(1000, 4, 4)}\n"
+        "slope = jax.jit(jax.grad(lambda x: g(x)[:, 0, 0].sum()))(y)\n"
+        "print(abs(found - f(x)).max(), abs(slope[:, 1] - np.cos(x[:, 0])).max() < 1e-6)\n"
+        "print(g.lower(y).compile().as_text().count('all-gather'))"
     )
-    assert np.isfinite(float(done.stdout))
+    assert run_alone(program).split() == ["0.0", "True", "0"]
+
+
+def run_alone(program: str) -> str:
+    return subprocess.run(
+        [sys.executable, "-c", program], stdout=subprocess.PIPE, encoding="utf-8", timeout=300, check=True
+    ).stdout
 
 
 @pytest.mark.parametrize("tier", TIERS)

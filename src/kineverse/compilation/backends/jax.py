@@ -185,8 +185,15 @@ def _in_c(
         _registered[name] = library.code
         jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(library.code), platform="cpu")
 
+    def like(x: Any) -> list[Any]:
+        empty = (range(x.ndim - 1, x.ndim - 1 + len(shape)) for shape in shapes)
+        return [
+            jax.numpy.broadcast_to(jax.numpy.expand_dims(x[..., 0], tuple(axes)), (*x.shape[:-1], *shape))
+            for axes, shape in zip(empty, shapes, strict=True)
+        ]
+
     def call(x: Any) -> list[Any]:
-        results = [jax.ShapeDtypeStruct((*x.shape[:-1], *shape), x.dtype) for shape in shapes]
+        results = jax.eval_shape(like, x)  # in shard_map they vary from device to device, as x does
         return list(jax.ffi.ffi_call(name, results, vmap_method="broadcast_all")(x))
 
     return call
