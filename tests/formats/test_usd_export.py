@@ -428,7 +428,7 @@ def test_shapes_and_colours(tmp_path: Path) -> None:
     saved = save(model, tmp_path / "m.usda")
     text = " ".join(saved.remarks)
     assert "lost.stl is left out" in text
-    assert "an ellipsoid to touch of 'part' is left out" in text
+    assert "an ellipsoid collider of 'part' is left out" in text
     stage = open_stage(tmp_path / "m.usda")
     part = named(stage, "part", UsdGeom.Xform)
     kinds = [child.GetTypeName() for child in part.GetChildren()]

@@ -317,11 +317,11 @@ def test_values_of_a_wrong_type_are_refused_or_left_out(tmp_path: Path) -> None:
     file.write_text(text.replace("double radius = 0.5", 'string radius = "big"'))
     model, remarks = load(file)
     assert "far" not in model.bodies
-    assert "/arm/far/ball has a size that is none" in remarks[0]
+    assert "/arm/far/ball has an invalid size" in remarks[0]
     file.write_text(
         text.replace("matrix4d xformOp:transform = (", "double3 xformOp:transform = (0, 0, 0) #", 1)
     )
-    with pytest.raises(FormatError, match="no USD that can be read"):
+    with pytest.raises(FormatError, match="not a readable USD file"):
         kv.load(file)
 
 
@@ -469,6 +469,10 @@ def test_what_is_not_read_is_said(tmp_path: Path) -> None:
         assert part in text
     with pytest.raises(FormatError, match="is left out"):
         load(tmp_path / "arm.usda", strict=True)
+    arm = Arm()
+    UsdGeom.Mesh.Define(arm.stage, "/arm/far/mesh")
+    with pytest.raises(FormatError, match="1 mesh is left out"):
+        load(arm.save(tmp_path / "mesh.usda"), strict=True)
 
 
 # -- refusals ------------------------------------------------------------------------------------------------
@@ -477,11 +481,11 @@ def test_what_is_not_read_is_said(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "content", "reason"),
     [
-        ("text.usda", b"hello", "can be read: it is not a valid usda layer."),
-        ("broken.usda", b'#usda 1.0\ndef Xform "a" {\n oops', "can be read: line 3:2: Expected }"),
-        ("empty.usd", b"", "no USD that can be read"),
-        ("bad.usdc", b"PXR-USDC" + b"\0" * 60, "no USD that can be read"),
-        ("cut.usdc", b"PXR-USDC\0\0", "no USD that can be read"),
+        ("text.usda", b"hello", "USD file: it is not a valid usda layer."),
+        ("broken.usda", b'#usda 1.0\ndef Xform "a" {\n oops', "USD file: line 3:2: Expected }"),
+        ("empty.usd", b"", "not a readable USD file"),
+        ("bad.usdc", b"PXR-USDC" + b"\0" * 60, "not a readable USD file"),
+        ("cut.usdc", b"PXR-USDC\0\0", "not a readable USD file"),
         ("nothing.usda", b"#usda 1.0\n", "nothing that moves: it is empty"),
         (
             "still.usda",
@@ -493,7 +497,7 @@ def test_what_is_not_read_is_said(tmp_path: Path) -> None:
             b'#usda 1.0\ndef "a" (references = @other.usda@</b>) {}',
             "composed of further files, other",
         ),
-        ("unit.usda", b"#usda 1.0\n(\n metersPerUnit = 0\n)\n", "measure nothing"),
+        ("unit.usda", b"#usda 1.0\n(\n metersPerUnit = 0\n)\n", "both have to be positive"),
     ],
 )
 def test_files_that_are_none_are_refused_in_one_line(
@@ -529,8 +533,8 @@ WRONG: dict[str, tuple[Callable[[Arm], object], str]] = {
     ),
     "two turns": (two_turns, "turns about two axes"),
     "far away": (lambda arm: arm.slide.CreateLocalPos0Attr((math.nan, 0, 0)), "not finite"),
-    "other type": (lambda arm: follow(arm, "/arm/hinge"), "no joint of its type"),
-    "no leader": (lambda arm: follow(arm, "/arm/far"), "no joint that is read"),
+    "other type": (lambda arm: follow(arm, "/arm/hinge"), "not a joint of its type"),
+    "no leader": (lambda arm: follow(arm, "/arm/far"), "not a joint that is read"),
     "itself": (lambda arm: follow(arm, "/arm/slide"), "mimics itself"),
 }
 

@@ -126,15 +126,15 @@ class UsdBodyReader:
             along = "XYZ".index(axis)
             across = [float(scale[k]) for k in range(3) if k != along]
             if not _same(*across) or (kind == "Capsule" and not _same(*scale.tolist())):
-                self._say(path, f"is a {kind.lower()} that is scaled to none")
+                self._say(path, f"is scaled to a shape that is no {kind.lower()}")
                 return None, axis
             sizes = [number("radius") * across[0], number("height") * float(scale[along])]
             form = {"Cylinder": Cylinder, "Capsule": Capsule, "Cone": Cone}[kind](*sizes)  # type: ignore[assignment]
         else:
-            self._say(path, f"is a {quote(kind)}, which no model has")
+            self._say(path, f"is a {quote(kind)}, a shape that is not read")
             return None, axis
         if not all(0 <= size < math.inf for size in sizes):
-            self._say(path, "has a size that is none")
+            self._say(path, "has an invalid size")
             return None, axis
         return form, axis
 

@@ -100,7 +100,7 @@ class UsdBodyWriter:
     def _shape(self, prim: Any, shape: Shape, own: str, name: str, is_collision: bool) -> None:
         path = prim.GetPath().AppendChild(own)
         if is_collision and isinstance(shape.geometry, Ellipsoid):
-            self._remark(f"an ellipsoid to touch of '{name}' is left out: colliders of USD have none")
+            self._remark(f"an ellipsoid collider of '{name}' is left out: UsdPhysics has none")
             return
         made = self._geometry(path, shape.geometry)
         if made is None:

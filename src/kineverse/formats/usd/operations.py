@@ -64,10 +64,7 @@ def usd_file_operations(file: FileContent) -> Iterator[tuple[str, Operation] | H
                 f"{changed}. Load it without strict to read its bodies and joints instead, or write it again."
             )
         warn([f"{changed}: its bodies and joints are read instead, as of any other stage."])
-    scene = read_scene(stage, file.path.name)
-    if file.strict and scene.remarks:
-        raise FormatError(scene.remarks[0])
-    yield from _scene_operations(scene, file)
+    yield from _scene_operations(read_scene(stage, file.path.name), file)
 
 
 def _scene_operations(scene: UsdScene, file: FileContent) -> Iterator[tuple[str, Operation]]:
@@ -81,10 +78,14 @@ def _scene_operations(scene: UsdScene, file: FileContent) -> Iterator[tuple[str,
         reader = UsdBodyReader(scene, source)
         bodies = {path: reader.read(body) for path, body in scene.bodies.items()}
         world = reader.read(None)
-    warn([*scene.remarks, *reader.finish()])
+    remarks = [*scene.remarks, *reader.finish()]
+    description = _as_sdf(scene, bodies, source, remarks)
+    if file.strict and remarks:
+        raise FormatError(remarks[0])
+    warn(remarks)
     if not is_empty_body(world):
         yield f"body {WORLD}", SetBody(WORLD, world)
-    for operation in sdf_operations(_as_sdf(scene, bodies, source), file.prefix):
+    for operation in sdf_operations(description, file.prefix):
         yield operation.default_tag(), operation
 
 
@@ -93,7 +94,7 @@ def _count_prims(scene: UsdScene) -> str:
     return "it is empty" if not count else f"it has {count} prim{'s' if count > 1 else ''}"
 
 
-def _as_sdf(scene: UsdScene, bodies: dict[str, Body], source: str) -> SdfScene:
+def _as_sdf(scene: UsdScene, bodies: dict[str, Body], source: str, remarks: list[str]) -> SdfScene:
     """Return a scene in the terms of SDF, whose reader makes the tree, the loops and the operations."""
     links = {
         path: SdfLink(
@@ -117,7 +118,6 @@ def _as_sdf(scene: UsdScene, bodies: dict[str, Body], source: str) -> SdfScene:
         joints += made
         between += more
     joints = _resolve_mimics(joints, scene, source)
-    remarks: list[str] = []
 
     def remark(joint: SdfJoint, text: str) -> None:
         remarks.append(f"{source}: the joint {joint.name} {text}")
@@ -125,7 +125,6 @@ def _as_sdf(scene: UsdScene, bodies: dict[str, Body], source: str) -> SdfScene:
     every = (*links.values(), *between)
     roots, tree, loops = build_spanning_tree(every, joints, (), remark)
     frames = tuple(SdfFrame(f.name, names[f.body], _pose(f.pose), source=source) for f in scene.frames)
-    warn(remarks)
     taken = TakenNames([WORLD, *(link.name for link in every), *(frame.name for frame in frames)])
     tree = tuple(_turned(joint, taken) for joint in tree)
     loops = tuple(replace(joint, frame=taken.take(joint.name, f"{joint.name}/end")) for joint in loops)
@@ -221,4 +220,4 @@ def _pose(matrix: Matrix) -> Pose:
     try:
         return Pose.from_matrix(round_exact(matrix))
     except ValueError as error:
-        raise FormatError(f"A pose on the stage is none: {summarize_error(error)}") from None
+        raise FormatError(f"A pose on the stage is invalid: {summarize_error(error)}") from None

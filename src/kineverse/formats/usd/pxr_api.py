@@ -106,7 +106,7 @@ def _open_layer(path: Path) -> Any:
         # A layer that is opened by its path may be an older one, which somebody in the process still holds.
         layer = layers.OpenAsAnonymous(str(path))
         if layer is None:
-            raise _unreadable(path, "its content is that of no USD file")
+            raise _unreadable(path, "its content is not USD")
         return layer
     try:
         text, reason = call_isolated(__name__, "export_layer", str(path.absolute()))
@@ -130,7 +130,7 @@ def export_layer(path: str) -> tuple[str, str]:
 
 
 def _unreadable(path: Path, reason: str) -> FormatError:
-    return FormatError(f"{path} is no USD that can be read: {reason}.")
+    return FormatError(f"{path} is not a readable USD file: {reason}.")
 
 
 @contextmanager
@@ -139,7 +139,7 @@ def refuse_errors(source: str) -> Iterator[None]:
     try:
         yield
     except pxr().Tf.ErrorException as error:
-        raise FormatError(f"{source} is no USD that can be read: {_reason(error, Path(source))}.") from None
+        raise FormatError(f"{source} is not a readable USD file: {_reason(error, Path(source))}.") from None
 
 
 def _reason(error: Exception, path: Path) -> str:

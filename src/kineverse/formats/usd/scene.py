@@ -151,7 +151,7 @@ def _read_units(stage: Any, source: str) -> UsdUnits:
     length = float(api.UsdGeom.GetStageMetersPerUnit(stage))
     mass = float(api.UsdPhysics.GetStageKilogramsPerUnit(stage))
     if not (0 < length < math.inf and 0 < mass < math.inf):
-        raise FormatError(f"{source}: its units are {length:g} m and {mass:g} kg, which measure nothing.")
+        raise FormatError(f"{source}: its units are {length:g} m and {mass:g} kg; both have to be positive.")
     rotation = np.eye(3)
     if api.UsdGeom.GetStageUpAxis(stage) == api.UsdGeom.Tokens.y:
         rotation = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
@@ -206,7 +206,7 @@ class _SceneReader:
             for d in parsed.get(kind, ()):
                 self._say(
                     d.primPath,
-                    f"is left out: a {kind.removesuffix('Joint').lower()} joint is none that is read",
+                    f"is left out: {kind.removesuffix('Joint').lower()} joints are not read",
                 )
         by_path = {joint.path: joint for joint in joints}
         every = self._stage.Traverse(pxr().Usd.TraverseInstanceProxies())
@@ -259,7 +259,7 @@ class _SceneReader:
             return None
         body0, body1 = (path if path in bodies else IN_WORLD for path in map(str, (found.body0, found.body1)))
         if body0 == body1:
-            self._say(found.primPath, "is left out: it connects no two bodies")
+            self._say(found.primPath, "is left out: it does not connect two bodies")
             return None
         name = text_of(prim, NAME) or prim.GetName()
         freedoms = tuple(read(found, name))
@@ -402,13 +402,13 @@ class _SceneReader:
         prim = self._stage.GetPrimAtPath(joint.path)
         leader = by_path.get(joint.mimic.leader)
         if leader is None:
-            self._refuse(prim, f"follows {quote(joint.mimic.leader)}, which is no joint that is read.")
+            self._refuse(prim, f"follows {quote(joint.mimic.leader)}, which is not a joint that is read.")
         kinds = [tuple(freedom.kind[:3] for freedom in each.freedoms) for each in (joint, leader)]
         is_mixed = bool(prim.GetRelationship(LEADER))
         single = [("rot",), ("tra",)]
         if not (kinds[0] in single and kinds[1] in single and (kinds[0] == kinds[1] or is_mixed)):
             self._refuse(
-                prim, f"follows {quote(leader.name)}, which is no joint of its type with one coordinate."
+                prim, f"follows {quote(leader.name)}, which is not a joint of its type with one coordinate."
             )
         return joint
 
