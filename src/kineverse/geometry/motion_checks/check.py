@@ -81,7 +81,7 @@ def _check_coordinate(parts: MovingParts, coordinate: Symbol, seen: set[int]) ->
         if group is groups[0]:
             yield from check_crossed_limits(part)
         if any(one in parts.model.rates for one in group.coordinates):
-            yield MotionFinding("no_sweep", "cannot_say", "speeds move its part", part.bodies, group.joint)
+            yield part.entry("no_sweep", "cannot_say", "speeds move its part")
         else:
             yield from _check_part(part)
         if group.number not in seen:

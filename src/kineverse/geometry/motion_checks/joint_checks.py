@@ -70,7 +70,7 @@ def check_crossed_limits(part: MovingPart) -> Iterator[MotionFinding]:
         shown = format_number(lower), format_number(upper)
         text = f"no value is within the limits: the lower one is {shown[0]}, the upper one {shown[1]}"
         unit = "rad" if part.turns else "m"
-        yield _finding(part, "crossed_limits", text, value=lower - upper, limit=0.0, unit=unit)
+        yield part.entry("crossed_limits", "finding", text, value=lower - upper, limit=0.0, unit=unit)
 
 
 def check_joint_limits(part: MovingPart) -> Iterator[MotionFinding]:
@@ -96,12 +96,10 @@ def _check_angles(part: MovingPart, axis: Axis, extent: float) -> Iterator[Motio
         is_open = sum(part.limits) == 0.0 and angle <= SYMMETRIC
         severity: Severity = "suspect" if is_open else "finding"
         limit = MOST_TURNS * math.tau
-        yield _finding(part, "degrees_for_radians", text, severity, value=angle, limit=limit, unit="rad")
+        yield part.entry("degrees_for_radians", severity, text, value=angle, limit=limit, unit="rad")
     elif angle < LEAST_ANGLE:
         text = f"turns by {format_number(math.degrees(angle), 3)}° only"
-        yield _finding(
-            part, "radians_for_degrees", text, "suspect", value=angle, limit=LEAST_ANGLE, unit="rad"
-        )
+        yield part.entry("radians_for_degrees", "suspect", text, value=angle, limit=LEAST_ANGLE, unit="rad")
 
 
 def _shifts_another(part: MovingPart) -> bool:
@@ -113,13 +111,15 @@ def _shifts_another(part: MovingPart) -> bool:
 def _check_lengths(part: MovingPart, travel: float) -> Iterator[MotionFinding]:
     if travel < min(LEAST_TRAVEL, LEAST_SHARE * part.size):
         text = f"moves by {format_length(travel)} only, and is {format_length(part.size)} large"
-        yield _finding(part, "millimetres_for_metres", text, value=travel, limit=LEAST_TRAVEL, unit="m")
+        yield part.entry(
+            "millimetres_for_metres", "finding", text, value=travel, limit=LEAST_TRAVEL, unit="m"
+        )
         return
     everything = part.parts.shape_of(part.parts.scene.bodies).size
     most = max(MOST_TRAVEL * part.size, 2.0 * everything)
     if travel > most:
         text = f"moves by {format_length(travel)}, and is {format_length(part.size)} large"
-        yield _finding(part, "millimetres_for_metres", text, value=travel, limit=most, unit="m")
+        yield part.entry("millimetres_for_metres", "finding", text, value=travel, limit=most, unit="m")
 
 
 def check_joint_axis(part: MovingPart) -> Iterator[MotionFinding]:
@@ -136,7 +136,7 @@ def check_joint_axis(part: MovingPart) -> Iterator[MotionFinding]:
         text = f"turns about an axis that is {format_length(gap)} away from it and from all else"
         is_certain = not part.is_robot_link and part.parts.solids(part.carrier)
         severity: Severity = "finding" if is_certain else "suspect"
-        yield _finding(part, "axis_outside", text, severity, value=gap, limit=most, unit="m")
+        yield part.entry("axis_outside", severity, text, value=gap, limit=most, unit="m")
 
 
 def check_plane(part: MovingPart) -> Iterator[MotionFinding]:
@@ -154,9 +154,7 @@ def check_plane(part: MovingPart) -> Iterator[MotionFinding]:
     tilt = math.acos(min(1.0, abs(float(directions[2] @ axis.direction))))
     if is_plate and tilt < NORMAL and beside > OFF_CENTER * longest:
         text = f"is flat, and turns in its own plane about a point {format_length(beside)} from its middle"
-        yield _finding(
-            part, "turned_axis", text, "suspect", value=beside, limit=OFF_CENTER * longest, unit="m"
-        )
+        yield part.entry("turned_axis", "suspect", text, value=beside, limit=OFF_CENTER * longest, unit="m")
 
 
 def check_moved_bodies(part: MovingPart) -> Iterator[MotionFinding]:
@@ -165,18 +163,18 @@ def check_moved_bodies(part: MovingPart) -> Iterator[MotionFinding]:
     carried = [body for group in part.parts.groups.subtree(part.group) for body in group.bodies]
     if not has_shapes(model, carried):
         if not part.parts.solid_bodies and not part.parts.unusable:
-            yield _finding(part, "no_shapes", "the model has no shapes", "cannot_say")
+            yield part.entry("no_shapes", "cannot_say", "the model has no shapes")
             return
         if not part.group.is_child:
             return  # a further frame of a mechanism, such as the end of an arm
         what = f"only the mass of {list_some(map(repr, carried), 3)}" if carried else "nothing"
         severity: Severity = "suspect" if carried or part.is_robot_link else "finding"
-        yield _finding(part, "moves_nothing", f"moves {what}: no shape hangs on it", severity)
+        yield part.entry("moves_nothing", severity, f"moves {what}: no shape hangs on it")
     elif part.parts.has_missing_shapes(part.group.bodies):
         names = list_some((repr(b) for b, _ in part.parts.unusable if b in part.group.bodies), 3)
-        yield _finding(part, "missing_shapes", f"shapes of {names} are missing or empty", "cannot_say")
+        yield part.entry("missing_shapes", "cannot_say", f"shapes of {names} are missing or empty")
     elif not part.solids:
-        yield _finding(part, "no_shapes", "it has no shapes of its own", "cannot_say")
+        yield part.entry("no_shapes", "cannot_say", "it has no shapes of its own")
 
 
 def check_scale(parts: MovingParts, bodies: Sequence[str], joint: str = "") -> Iterator[MotionFinding]:
@@ -197,16 +195,3 @@ def check_scale(parts: MovingParts, bodies: Sequence[str], joint: str = "") -> I
         return
     text = f"'{body}' is {format_length(sizes[body])} large{others}"
     yield MotionFinding("wrong_scale", "suspect", text, (body,), joint, sizes[body], limit, "m")
-
-
-def _finding(
-    part: MovingPart,
-    kind: str,
-    text: str,
-    severity: Severity = "finding",
-    *,
-    value: float | None = None,
-    limit: float | None = None,
-    unit: str = "",
-) -> MotionFinding:
-    return MotionFinding(kind, severity, text, part.bodies, part.group.joint, value, limit, unit)

@@ -20,6 +20,7 @@ from kineverse.state import State
 from kineverse.symbols import Symbol
 
 from .part_shape import PartShape, shape_points
+from .report import MotionFinding, Severity
 from .rigid_groups import SAME_AXIS, Axis, RigidGroup, RigidGroups
 
 STATES = 25  # states in which a coordinate is looked at: steps of 4° for a door, of 2 cm for a drawer
@@ -228,6 +229,23 @@ class MovingPart:
         lower = lower if math.isfinite(lower) else min(self.home, upper) - reach
         upper = upper if math.isfinite(upper) else max(self.home, lower) + reach
         return lower, upper
+
+    def entry(
+        self,
+        kind: str,
+        severity: Severity,
+        text: str,
+        *,
+        value: float | None = None,
+        limit: float | None = None,
+        unit: str = "",
+        state: State | None = None,
+        against: str = "",
+    ) -> MotionFinding:
+        """Return an entry of the report about the part, measured at a state."""
+        at = {} if state is None else {str(self.coordinate): float(state[self.coordinate])}
+        joint = self.group.joint
+        return MotionFinding(kind, severity, text, self.bodies, joint, value, limit, unit, at, against)
 
     def is_unlimited(self, state: State) -> bool:
         """Return True if no limit is on the side of a state."""

@@ -217,7 +217,7 @@ def check_sweep(part: MovingPart) -> Iterator[MotionFinding]:
     """Yield what a sweep of the coordinate shows about a part with shapes."""
     if not part.parts.solids(part.carrier):
         text = f"what carries it, '{part.group.parent}', has no shapes"
-        yield _entry(part, "no_shapes", "cannot_say", text)
+        yield part.entry("no_shapes", "cannot_say", text)
         return
     sweep = Sweep(part)
     if sweep.floats:
@@ -239,7 +239,7 @@ def check_sweep(part: MovingPart) -> Iterator[MotionFinding]:
         )
         if part.is_unlimited(loose):
             kind, text = "no_limits", f"{text}, as no limit stops it"
-        yield _entry(part, kind, "suspect", text, limit=sweep.reach, unit="m", state=loose)
+        yield part.entry(kind, "suspect", text, limit=sweep.reach, unit="m", state=loose)
 
 
 def _floating(part: MovingPart, sweep: Sweep) -> Iterator[MotionFinding]:
@@ -249,7 +249,7 @@ def _floating(part: MovingPart, sweep: Sweep) -> Iterator[MotionFinding]:
     pairs = [(body, other) for body in part.solids for other in sweep.others]
     distance = min(found.distance for found in parts.scene.distances(pairs))
     text = f"is {format_length(distance)} away from everything, and {format_length(part.size)} large"
-    yield _entry(part, "floats", severity, text, value=distance, limit=sweep.reach, unit="m")
+    yield part.entry("floats", severity, text, value=distance, limit=sweep.reach, unit="m")
 
 
 def _gap(part: MovingPart, sweep: Sweep) -> Iterator[MotionFinding]:
@@ -259,7 +259,7 @@ def _gap(part: MovingPart, sweep: Sweep) -> Iterator[MotionFinding]:
         far = format_length(sweep.rest_gap) if is_near else f"at least {format_length(sweep.reach)}"
         value = sweep.rest_gap if is_near else None
         text = f"is {far} away from everything at rest"
-        yield _entry(part, "gap", "suspect", text, value=value, limit=limit, unit="m")
+        yield part.entry("gap", "suspect", text, value=value, limit=limit, unit="m")
 
 
 def _entering(part: MovingPart, sweep: Sweep, overlap: SweptOverlap) -> MotionFinding:
@@ -269,8 +269,7 @@ def _entering(part: MovingPart, sweep: Sweep, overlap: SweptOverlap) -> MotionFi
         kind, what = "no_limits", f"{what}, as no limit stops it"
     elif explained := _explain(part, sweep):
         kind, what = explained[0], f"{what}; {explained[1]}"
-    return _entry(
-        part,
+    return part.entry(
         kind,
         "suspect",
         what,
@@ -287,8 +286,8 @@ def _swallowed(part: MovingPart, sweep: Sweep, body: str, share: float, state: S
     kind = "no_limits" if part.is_unlimited(state) else "into_carrier"
     if kind == "into_carrier" and sweep.find_swallowing_body(mirrored=True) is None:
         kind, text = "flipped_axis", f"{text}; the other way it is free"
-    return _entry(
-        part, kind, "suspect", text, value=share, limit=SWALLOWED, unit="1", state=state, against=body
+    return part.entry(
+        kind, "suspect", text, value=share, limit=SWALLOWED, unit="1", state=state, against=body
     )
 
 
@@ -347,20 +346,3 @@ def _is_free_about(part: MovingPart, sweep: Sweep, axis: Axis) -> bool:
 
 def _format_direction(direction: Floats) -> str:
     return f"({', '.join(format_number(x, 2) for x in direction.tolist())})"
-
-
-def _entry(
-    part: MovingPart,
-    kind: str,
-    severity: Severity,
-    text: str,
-    *,
-    value: float | None = None,
-    limit: float | None = None,
-    unit: str = "",
-    state: State | None = None,
-    against: str = "",
-) -> MotionFinding:
-    at = {} if state is None else {str(part.coordinate): float(state[part.coordinate])}
-    joint = part.group.joint
-    return MotionFinding(kind, severity, text, part.bodies, joint, value, limit, unit, at, against)
