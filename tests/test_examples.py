@@ -62,7 +62,7 @@ notch at 0.8 m: height 0.755 m, level: True
     "20_plan_a_motion": "8 joints, ... points, ... s\nnothing is nearer than ... mm",
     "23_learn_a_hinge": "... mm between ...\nx = 301 mm, in truth 300 mm\ny = -201 mm, ...\nroll = 1.5°, in truth 1.5°\npitch = -2.0°, ...",
     "21_live_system": "...joint door is revolute\n...the door is open by 1.2 rad...",
-    "22_calibrate": "Calibration of 13 parameters from 30 looks\n...in looks 7\n...7 lines of the URDF are new",
+    "22_calibrate": "Calibration of 13 parameters from 30 looks\n...in look 7\n...7 lines of the URDF are new",
     "24_check_a_model": "door: degrees_for_radians: ...\ndrawer: flipped_axis: ...\nmended: nothing is wrong",
 }
 
