@@ -21,7 +21,8 @@ from differentiable import (
 
 import kineverse as kv
 from kineverse.compilation import c_library
-from kineverse.compilation.backends.array_source import array_source
+from kineverse.compilation.backends.array_source import load_operations
+from kineverse.compilation.program import Program
 from kineverse.errors import (
     CompileError,
     ExpressionError,
@@ -85,25 +86,20 @@ def test_autograd_differentiates_twice(torch: Any, tier: Any) -> None:
 
 def test_derivatives_of_operations_agree_with_those_of_autograd_where_smooth(torch: Any) -> None:
     """Automatic differentiation of the very program, without rules of its own."""
-    from kineverse.compilation.program import Program
-
     case = CASES["robot_arm"]()
-    source = array_source(Program(case.outputs, case.inputs), [e.shape for e in case.outputs])
-    names: dict[str, Any] = {"m": torch}
-    exec(source, names)
+    evaluate = load_operations(Program(case.outputs, case.inputs), [e.shape for e in case.outputs], m=torch)(
+        False
+    )
     x = torch.tensor(case.points[0])
-    plain = torch.func.jacfwd(
-        lambda x: names["evaluate"](x, lambda n: torch.full((), n, dtype=torch.float64))
-    )(x)
+    plain = torch.func.jacfwd(lambda x: evaluate(x, lambda n: torch.full((), n, dtype=torch.float64)))(x)
     for ours, theirs in zip(torch.func.jacfwd(kv.to_torch(case.outputs, case.inputs))(x), plain, strict=True):
         np.testing.assert_allclose(ours, theirs, atol=1e-14)
 
 
 def test_every_operation_has_the_value_of_the_interpreter(torch: Any) -> None:
     program, points = operations()
-    names: dict[str, Any] = {"m": torch, "erf": torch.erf}
-    exec(array_source(program, [()] * len(program.sizes)), names)
-    results = names["evaluate"](torch.tensor(points), lambda n: torch.full((), n, dtype=torch.float64))
+    evaluate = load_operations(program, [()] * len(program.sizes), m=torch, erf=torch.erf)(False)
+    results = evaluate(torch.tensor(points), lambda n: torch.full((), n, dtype=torch.float64))
     assert_same_operations(torch.stack(results, -1).numpy(), program, points)
 
 
@@ -119,6 +115,7 @@ def test_doubles_are_those_of_a_batch_for_any_leading_dimensions(torch: Any) -> 
         np.testing.assert_array_equal(found.reshape(-1, 4, 4), wanted.batch(points.reshape(-1, 7)))
     strided = torch.rand((7, 24), dtype=torch.float64).T
     np.testing.assert_array_equal(f(strided), wanted.batch(strided.numpy()))
+    np.testing.assert_array_equal(f(torch._neg_view(strided)), wanted.batch(-strided.numpy()))
     with pytest.raises(InvalidValueError, match="The tensor is on meta, and tier 'c' is for the CPU"):
         f(points.to("meta"))
 
@@ -134,6 +131,22 @@ def test_results_have_the_type_of_the_argument(torch: Any, tier: Any) -> None:
         np.testing.assert_allclose(one, two, atol=2e-6)
     assert {r.dtype for r in torch.func.jacrev(f)(x[0].float())} == {torch.float32}
     assert {r.dtype for r in f([1, 2])} == {torch.get_default_dtype()}
+    assert {r.dtype for r in f(torch.ones(2, dtype=torch.uint16))} == {torch.get_default_dtype()}
+
+
+@pytest.mark.parametrize("tier", TIERS)
+def test_derivatives_have_all_digits_with_autocast(torch: Any, tier: Any) -> None:
+    f = kv.to_torch(kv.rotation_z(A) * SIZE, [A, SIZE], tier=tier)
+    x, v = torch.rand((2, 5, 2))
+
+    def derivatives() -> list[Any]:
+        values, pull = torch.func.vjp(f, x)
+        return [values, *pull(torch.ones_like(values)), *torch.func.jvp(f, (x,), (v,))]
+
+    plain = derivatives()
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        for one, two in zip(derivatives(), plain, strict=True):
+            assert torch.equal(one, two)
 
 
 def test_operations_run_where_the_tensor_is(torch: Any) -> None:
@@ -181,10 +194,18 @@ def test_without_a_compiler_it_is_interpreted(torch: Any, monkeypatch: pytest.Mo
 
 def test_wrong_use_is_told(torch: Any) -> None:
     f = kv.to_torch([A, kv.rotation_z(B)], [A, B])
-    with pytest.raises(ShapeError, match=r"of shape \(\.\.\., 2\), with a, b along its last axis"):
+    with pytest.raises(ShapeError, match=r"of shape \(\.\.\., 2\), with 'a', 'b' along its last axis"):
         f(torch.zeros(3))
-    with pytest.raises(ShapeError, match="not a dict"):
-        f({"a": 1.0, "b": 2.0})
+    x = torch.ones(2)
+    wrong: Any
+    for wrong, said in (
+        ({"a": 1.0, "b": 2.0}, "not a dict"),
+        (np.ma.masked_array([1.0, 2.0], [False, True]), "not a MaskedArray"),
+        ([x[0], 2.0], r"one tensor, not a list of tensors. Write torch\.stack\(values, dim=-1\)"),
+        (([x[0], x[1]], [x[0], x[1]]), "not a tuple of tensors"),
+    ):
+        with pytest.raises(ShapeError, match=said):
+            f(wrong)
     for wrong in (torch.float16, torch.bool, torch.complex128):
         with pytest.raises(InvalidValueError, match="float32 or float64, not torch"):
             f(torch.zeros(2, dtype=wrong))

@@ -18,6 +18,8 @@ from published_data import published_files
 EXACT = 1e-12
 SCENES = [f"articulations/{name}" for name in gallery.names()]
 SHIPPED = list(shipped_models())
+CURVES = ("cam", "mimic", "ackermann", "garage_door_as_published", "folding_door", "piston", "pedal_bin")
+"""Scenes with motions by curves, which SDF and UsdPhysics do not have."""
 
 
 def readable_urdf_files() -> list[Path | None]:

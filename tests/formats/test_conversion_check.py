@@ -102,6 +102,41 @@ def test_planes_that_pinocchio_lacks_are_told(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("ending", ENDINGS)
+@pytest.mark.parametrize("leader", ["ball/qx", "free/x", "flat/x"])
+def test_followers_of_joints_with_several_coordinates_move_alike_or_are_refused(
+    leader: str, ending: str, tmp_path: Path
+) -> None:
+    kinds = {"ball": kv.articulations.Ball, "free": kv.Floating, "flat": kv.Planar}
+    name = leader.partition("/")[0]
+    model, file = kv.Model(), tmp_path / f"m.{ending}"
+    with model.edit() as edit:
+        edit.apply(kinds[name](name=name, parent="world", child="a"))
+        edit.apply(kv.Prismatic(name="f", parent="a", child="b", position=0.5 * kv.position(leader)))
+    if leader == "ball/qx":
+        with pytest.raises(kv.errors.FormatError, match="'f' follows 'ball/qx', which is the position of no"):
+            model.save(file)
+    elif (leader, ending) == ("free/x", "urdf"):
+        with pytest.raises(kv.errors.FormatError, match="'free' turns by a quaternion"):
+            model.save(file)
+    else:
+        model.save(file)
+        assert kv.formats.check_conversion(model, file, states=20).ok
+        assert kv.load(file).degrees_of_freedom == model.degrees_of_freedom
+
+
+@pytest.mark.parametrize("ending", ENDINGS)
+def test_a_joint_that_the_model_lacks_and_a_missing_file_are_errors(ending: str, tmp_path: Path) -> None:
+    model, file = arm(), tmp_path / f"m.{ending}"
+    with pytest.raises(kv.errors.FormatError, match="there is no such file"):
+        kv.formats.check_conversion(model, file)
+    with model.edit() as edit:
+        edit.apply(kv.Revolute(name="more", parent="d", child="h"))
+    model.save(file)
+    with pytest.raises(kv.errors.FormatError, match=rf"m.{ending} has a joint with the coordinate 'more'"):
+        kv.formats.check_conversion(arm(), file)
+
+
+@pytest.mark.parametrize("ending", ENDINGS)
 def test_a_broken_file_and_a_missing_frame_are_errors(ending: str, tmp_path: Path) -> None:
     model, file = arm(), tmp_path / f"m.{ending}"
     file.write_text("<nonsense/>")

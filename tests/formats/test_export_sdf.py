@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from random_trees import KINDS, trees
-from round_trip import SCENES, SHIPPED, assert_same_bodies, assert_same_motion, load_cached
+from round_trip import CURVES, SCENES, SHIPPED, assert_same_bodies, assert_same_motion, load_cached
 from test_export_names import NAMES, named
 from test_export_urdf import REFUSED
 
@@ -25,7 +25,6 @@ from kineverse.model.body import Body, Box, Capsule, Cone, Ellipsoid, Inertia, M
 pytest.importorskip("pydrake")
 
 LOOPS = ("slider_crank", "four_bar", "parallel_gripper", "scissor_linkage", "delta_robot", "jansen_leg")
-CURVES = ("cam", "mimic", "ackermann", "garage_door_as_published", "folding_door", "piston", "pedal_bin")
 
 
 def saved(model: kv.Model, folder: Path) -> kv.Model:
@@ -167,6 +166,41 @@ def test_a_loop_closes_at_the_poses_of_the_file(name: str, tmp_path: Path) -> No
         np.testing.assert_allclose(again.fk(frame)(at), model.fk(frame)(at), rtol=0, atol=1e-9)
 
 
+def test_models_that_are_included_twice_have_loops_and_homes_of_their_own(tmp_path: Path) -> None:
+    model = load_cached("articulations/four_bar")
+    model.save(tmp_path / "m.sdf")
+    includes = (f"<include><uri>m.sdf</uri><name>{name}</name></include>" for name in ("one", "two"))
+    (tmp_path / "w.sdf").write_text(f'<sdf version="1.11"><world name="w">{"".join(includes)}</world></sdf>')
+    both = kv.load(tmp_path / "w.sdf")
+    assert {str(s) for s in both.degrees_of_freedom} == {"one/four_bar/crank", "two/four_bar/crank"}
+    for frame in model.frames:
+        expected = model.fk(frame)(kv.State({"four_bar/crank": 0.7}))
+        for name in ("one", "two"):
+            found = both.fk(f"{name}/{frame}")(kv.State({f"{name}/four_bar/crank": 0.7}))
+            np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9)
+
+
+def test_homes_that_are_no_orientation_are_ignored_with_a_remark(tmp_path: Path) -> None:
+    model = built(kv.Floating(name="f", parent="world", child="a"), SetHome("f", (1, 0, 0, 0, 0, 0.6, 0.8)))
+    model.save(tmp_path / "m.sdf")
+    text = (tmp_path / "m.sdf").read_text()
+    assert 'home="1 0 0 0 0 0.6 0.8"' in text
+    (tmp_path / "m.sdf").write_text(text.replace("0 0 0.6 0.8", "0 0 0 0"))
+    with collect_warnings() as remarks:
+        again = kv.load(tmp_path / "m.sdf")
+    assert "has the quaternion 0 0 0 0, which is no orientation; it is ignored" in remarks[0]
+    assert again.default_state()["f/qw"] == 1
+
+
+def test_two_links_of_one_name_are_refused_on_one_line(tmp_path: Path) -> None:
+    links = '<link name="a" kineverse:name="b"/><link name="b"/>'
+    (tmp_path / "m.sdf").write_text(
+        f'<sdf version="1.11" xmlns:kineverse="{NAMESPACE}"><model name="m">{links}</model></sdf>'
+    )
+    with pytest.raises(kv.errors.FormatError, match='would be called "b" here, as the link of line 1 is'):
+        kv.load(tmp_path / "m.sdf")
+
+
 def tied(y: float) -> kv.Model:
     """Return a lever whose tip at (1, y) has to meet a slider on the x axis."""
     model = built(
@@ -217,7 +251,7 @@ def test_bodies_are_those_of_the_model(tmp_path: Path) -> None:
     assert ElementTree.parse(tmp_path / "m.sdf").getroot().get("version") == "1.12"
     remarks = model.save(tmp_path / "m.sdf").remarks
     assert any("the inertia of 'a' is that of no body" in remark for remark in remarks)
-    assert any("links without mass have 0.001 kg" in remark for remark in remarks)
+    assert "SDF has no links without mass: b, c, d weigh 0.001 kg" in remarks
 
 
 def test_dynamics_and_limits_are_written_or_told(tmp_path: Path) -> None:
@@ -291,6 +325,7 @@ def test_curves_within_a_tolerance_stay_within_their_bounds(tmp_path: Path) -> N
         ("zero", "nonsense"),
         ("zero", "1 2"),
         ("home", "nan"),
+        ("home", "1 2 3 4"),
         ("loop", "{"),
         ("loop", '{"name": 3, "dependent": null}'),
     ],

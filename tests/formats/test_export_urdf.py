@@ -313,3 +313,15 @@ def test_non_finite_numbers_are_refused(tmp_path: Path) -> None:
         edit.add_frame("f", parent="world", transform=np.eye(4), body=Body((Shape(Sphere(np.nan)),)))
     with pytest.raises(kv.errors.FormatError, match=r"m\.urdf is not written.*finite numbers only"):
         model.save(tmp_path / "m.urdf")
+
+
+def test_default_positions_are_told(tmp_path: Path) -> None:
+    model = kv.Model()
+    with model.edit() as edit:
+        for name, at in (("q", 0.5), ("r", 0.25)):
+            edit.apply(kv.Revolute(name=name, parent="world", child=name, lower=0.25, upper=1))
+            edit.apply(kv.model.basic_operations.SetHome(name, (at,)))
+        edit.apply(kv.Floating(name="f", parent="world", child="f"))
+        edit.apply(kv.model.basic_operations.SetHome("f", (0, 0, 1, 0, 0.6, 0, 0.8)))
+    remarks = model.save(tmp_path / "m.urdf").remarks
+    assert remarks == ("URDF has no default positions: those of q, f/z, f are left out",)

@@ -153,7 +153,7 @@ def test_meshes_are_those_of_the_leaves_and_turned_upright(write):
         {"id": 7, "objs": [], "children": [{"id": 1, "objs": ["box"]}, {"id": 2, "objs": ["box", "gone"]}]}
     ]
     file = write(
-        part(0, -1, "fixed", "base", parts=[7]), part(1, 0, "hinge", "door", parts=[1]), result=result
+        part(0, -1, "fixed", "base", parts=[7, 1]), part(1, 0, "hinge", "door", parts=[1]), result=result
     )
     with collect_warnings() as said:
         model = kv.load(file)

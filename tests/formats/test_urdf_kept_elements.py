@@ -100,6 +100,17 @@ def test_a_prefix_is_that_of_names_of_links_and_joints_alone(robot: Path, tmp_pa
     assert root.find("transmission/actuator[@name='hinge_motor']") is not None
 
 
+def test_references_and_comments_do_not_hide_a_name(tmp_path: Path) -> None:
+    (tmp_path / "r.urdf").write_text(
+        "<robot name='r'><link name='b&#228;r'/><gazebo reference='b&#xe4;r'><x><link/>bär</x>"
+        "<link><!-- bär -->b&#228;r<!-- --></link></gazebo></robot>"
+    )
+    gazebo = written(kv.load(tmp_path / "r.urdf", "L"), tmp_path).find("gazebo")
+    assert gazebo is not None
+    assert (gazebo.get("reference"), gazebo.findtext("link")) == ("L/bär", "L/bär")
+    assert "".join(gazebo.itertext()) == "bärL/bär"
+
+
 def test_two_robots_in_one_model_keep_theirs(robot: Path, tmp_path: Path) -> None:
     model = kv.Model()
     for side in ("left", "right"):
@@ -127,8 +138,8 @@ def test_what_names_a_removed_joint_is_left_out_with_a_remark(robot: Path, tmp_p
     result = model.save(tmp_path / "out.urdf")
     root = ElementTree.parse(tmp_path / "out.urdf").getroot()
     assert (
-        "<calibration>, <gazebo>, <transmission>, <ros2_control> of the file that was read, which is about "
-        "'hinge', is left out: that is gone" in result.remarks
+        "'hinge' is gone, and so is what the URDF that was read says of it: "
+        "<calibration>, <gazebo>, <transmission>, <ros2_control>" in result.remarks
     )
     kept = texts(ElementTree.fromstring(ROBOT), "gazebo")[::2]
     assert texts(root, *TAGS) == [*kept, "<self_collision_checking></self_collision_checking>"]

@@ -110,6 +110,7 @@ class Batch:
         self._insist = tier == "c"
         self._spent = 0.0
         self._library: ProgramLibrary[BatchFunction] | None = None
+        self._several: tuple[CasadiFunction, int, CasadiFunction] | None = None  # the last map, slow to make
         if tier != "interpreter" and not missing_operations(program):
             level = vector_optimisation_level(program.instructions)
             self._library = ProgramLibrary(
@@ -221,8 +222,11 @@ class Batch:
             count = min(_MAPPED, end - first)
             vectors = np.zeros((count, size))
             outputs = [np.zeros((count, s)) for s in self._program.sizes]
-            several = function.map(count) if count > 1 else function
-            run, _keep = bind(several, vectors, outputs, None)
+            several = self._several
+            if several is None or several[0] is not function or several[1] != count:
+                mapped = function.map(count) if count > 1 else function
+                several = self._several = function, count, mapped
+            run, _keep = bind(several[2], vectors, outputs, None)
             for start in range(first, end, count):
                 stop = min(start + count, end)
                 # In the last round, rows of the previous one are evaluated again and ignored.

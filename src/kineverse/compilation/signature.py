@@ -73,11 +73,11 @@ class Signature:
         # A mapping is written for this function, so unknown names are mistakes.
         if unknown:
             raise UnknownNameError(
-                f"Not among the inputs: {_listed(unknown)}. {suggest(unknown[0], self.names, 'input')}"
+                f"Not among the inputs: {name_list(unknown)}. {suggest(unknown[0], self.names, 'input')}"
             )
         missing = [name for name, value in zip(self.names, vector, strict=True) if value is None]
         if missing:
-            raise UnknownNameError(f"No value is given for {_listed(missing)}.")
+            raise UnknownNameError(f"No value is given for {name_list(missing)}.")
         return np.array(vector, dtype=np.float64)
 
     def _number(self, position: int, value: Any) -> float:
@@ -92,7 +92,7 @@ class Signature:
         return number
 
     def _described(self) -> str:
-        return f"{self.size} numbers ({_listed(self.names, 6)})" if self.size else "no numbers"
+        return f"{self.size} numbers ({name_list(self.names, 6)})" if self.size else "no numbers"
 
 
 def make_signature(
@@ -108,14 +108,14 @@ def make_signature(
         if missing:
             names = sorted(str(s) for s in missing)
             raise UnknownNameError(
-                f"The outputs depend on symbols that are not among the inputs: {_listed(names)}."
+                f"The outputs depend on symbols that are not among the inputs: {name_list(names)}."
             )
     if len(set(result.names)) < result.size:
         names = sorted({n for n in result.names if result.names.count(n) > 1})
         equal = len(set(result.inputs)) < result.size
         reason = "given twice" if equal else "the name of several symbols (of different roles or values)"
         raise DuplicateNameError(
-            f"The inputs of a function have names of their own: {_listed(names)} is {reason}."
+            f"The inputs of a function have names of their own: {name_list(names)} is {reason}."
         )
     return result
 
@@ -159,6 +159,7 @@ def _brief(value: object) -> str:
     return text if len(text) <= 60 else f"a {type(value).__name__}"
 
 
-def _listed(names: Sequence[str], limit: int = _LISTED) -> str:
+def name_list(names: Sequence[str], limit: int = _LISTED) -> str:
+    """Return names for an error, the first of them if they are many."""
     more = f" and {len(names) - limit} more" if len(names) > limit else ""
     return ", ".join(f"'{n}'" for n in names[:limit]) + more

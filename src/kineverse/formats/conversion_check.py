@@ -105,7 +105,12 @@ def check_conversion(
     distance, angle = np.zeros(len(names)), np.zeros(len(names))
     chosen = [columns[name] for name in names]
     for state, expected in zip(values, poses, strict=True):
-        found = engine.poses(state)[chosen]
+        try:
+            found = engine.poses(state)[chosen]
+        except KeyError as error:
+            raise FormatError(
+                f"{Path(path).name} has a joint with the coordinate {error}, which the model lacks."
+            ) from None
         distance = np.maximum(distance, np.linalg.norm(found[:, :3, 3] - expected[:, :3, 3], axis=1))
         turned = np.swapaxes(found[:, :3, :3], 1, 2) @ expected[:, :3, :3]
         angle = np.maximum(angle, rotation_angle(turned))

@@ -20,6 +20,7 @@ Matrix: TypeAlias = npt.NDArray[np.float64]
 Coefficients: TypeAlias = tuple[float, ...]  # coefficients of the powers of a coordinate, constant first
 
 IDENTITY_COEFFICIENTS: Coefficients = (0.0, 1.0)
+_SPACE = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 
 
 def dynamics_number(dynamics: Mapping[str, Any], key: str) -> float | None:
@@ -41,6 +42,11 @@ class JointBounds:
     min_velocity: float = -math.inf
     max_velocity: float = math.inf
     soft: tuple[float, float] | None = None
+
+    @property
+    def home(self) -> float:
+        """Position at which a joint without a stated home begins: the one nearest to 0."""
+        return min(max(0.0, self.lower), self.upper)
 
     @property
     def is_unbounded(self) -> bool:
@@ -90,6 +96,23 @@ class LinkDescription:
     dynamics: Mapping[str, Any] = field(default_factory=dict)
     is_loose: bool = False  # True if it moves as no joint of the format; the pose is that at home
 
+    @property
+    def free_motion(self) -> str:
+        """Name of its motion if it moves freely in its parent, ``name/x`` … ``name/qw``; else empty."""
+        if len(self.joints) != 4:
+            return ""
+        *slides, ball = self.joints
+        if not isinstance(ball, BallJointDescription) or any(ball.point) or ball.dynamics:
+            return ""
+        for joint, (c, axis) in zip(slides, _SPACE.items(), strict=True):
+            if not isinstance(joint, JointDescription) or joint.is_rotation or joint.axis != axis:
+                return ""
+            if joint.name != f"{ball.name}/{c}" or not joint.is_independent or joint.dynamics:
+                return ""
+            if joint.bounds != JointBounds():
+                return ""
+        return ball.name
+
 
 @dataclass(frozen=True)
 class SumLimit:
@@ -138,6 +161,11 @@ class RobotDescription:
     def joints(self) -> list[JointDescription]:
         """All rotational and translational joints."""
         return [joint for link in self.links for joint in link.joints if isinstance(joint, JointDescription)]
+
+    def has_followers(self, link: LinkDescription) -> bool:
+        """Return whether another joint follows one of a link: then each of these has to be a joint."""
+        own = {joint.name for joint in link.joints}
+        return any(joint.symbol.path in own for joint in self.joints if not joint.is_independent)
 
 
 @dataclass(frozen=True)

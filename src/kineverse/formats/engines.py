@@ -22,6 +22,7 @@ import numpy.typing as npt
 
 from kineverse._extras import install_command
 from kineverse.errors import FormatError, MissingDependencyError
+from kineverse.formats.files import read_file
 from kineverse.formats.poses import pose_from_quaternion
 from kineverse.formats.sdf.custom_attributes import FREE, HOME, LOOP, NAME, NAMESPACE, ZERO
 from kineverse.lie import rotation_angle
@@ -46,7 +47,7 @@ class PoseEngine(ABC):
     equal: ClassVar[float] = 1e-9  # largest difference of a pose [m], [rad] that is rounding
 
     def __init__(self, path: Path) -> None:
-        self.path = path
+        self.path, self.content = path, read_file(path)
         self.frames: Sequence[str] = ()
         self.skipped: Container[str] = ()
         self.remarks: list[str] = []
@@ -94,7 +95,7 @@ class PinocchioEngine(PoseEngine):
         super().__init__(path)
         self._pin = self.require()
         try:
-            text = path.read_text(encoding="utf-8")
+            text = self.content.decode()
             self._model = self._pin.buildModelFromXML(text)
             root = ElementTree.fromstring(text)
         except (ValueError, RuntimeError, ElementTree.ParseError) as error:
@@ -226,7 +227,7 @@ class DrakeEngine(PoseEngine):
 
         ElementTree.register_namespace("kineverse", NAMESPACE)
         try:
-            root = ElementTree.fromstring(path.read_bytes())
+            root = ElementTree.fromstring(self.content)
         except ElementTree.ParseError as error:
             raise self.refuse(error) from None
         model = root.find("model")

@@ -7,7 +7,9 @@ is ``jax.numpy`` or ``torch``: they have the same names.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import cache
+from typing import Any
 
 import casadi as ca
 
@@ -63,6 +65,25 @@ _REMAINDER = """\
         s = m.where((r + r > b) & (s + s >= b), s - b, s)
         return m.where(a < zero, -s, s)
 """
+
+
+def load_operations(
+    program: Program, shapes: Sequence[ArrayShape], **functions: Any
+) -> Callable[[bool], Callable[[Any, Callable[[float], Any]], list[Any]]]:
+    """Return a function that gives ``evaluate`` of :func:`array_source`, in single precision or not.
+
+    ``functions`` are ``m``, ``erf`` and ``erfinv`` of the source.
+    """
+
+    @cache
+    def load(single_precision: bool) -> Callable[[Any, Callable[[float], Any]], list[Any]]:
+        source = array_source(program, shapes, single_precision=single_precision)
+        names = dict(functions)
+        exec(compile(source, "<kineverse operations>", "exec"), names)
+        evaluate: Callable[[Any, Callable[[float], Any]], list[Any]] = names["evaluate"]
+        return evaluate
+
+    return load
 
 
 def array_source(program: Program, shapes: Sequence[ArrayShape], *, single_precision: bool = False) -> str:

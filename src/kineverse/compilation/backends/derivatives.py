@@ -11,7 +11,7 @@ import pickle
 from collections.abc import Iterable, Sequence
 
 from kineverse.compilation.program import Program
-from kineverse.compilation.signature import make_signature
+from kineverse.compilation.signature import make_signature, name_list
 from kineverse.errors import CompileError, ExpressionError, InvalidValueError, ShapeError, UnknownNameError
 from kineverse.expressions import Expression, ExpressionLike, array
 from kineverse.expressions.expression import NO_NODES, from_casadi
@@ -72,10 +72,9 @@ class DerivativePrograms:
         """Raise an error unless the last of some axes has an entry for each input."""
         count = len(self.names)
         if not shape or shape[-1] != count:
-            listed = ", ".join(self.names[:12]) + (", ..." if count > 12 else "")
             raise ShapeError(
-                f"Expected an array of shape (..., {count}), with {listed} along its last axis, not one of "
-                f"shape {tuple(shape)}."
+                f"Expected an array of shape (..., {count}), with {name_list(self.names)} along its last "
+                f"axis, not one of shape {tuple(shape)}."
             )
 
 
@@ -83,6 +82,14 @@ def check_tier(tier: str) -> None:
     """Raise an error for an unknown tier."""
     if tier not in ("auto", "c", "operations"):
         raise InvalidValueError(f"Unknown tier {tier!r}; tiers are 'auto', 'c' and 'operations'.")
+
+
+def array_error(x: object) -> ShapeError:
+    """Return the error for what is no array of numbers."""
+    of = " of entries that form no array" if isinstance(x, (list, tuple)) else ""
+    return ShapeError(
+        f"Expected one array of numbers, in the order of the inputs, not a {type(x).__name__}{of}."
+    )
 
 
 def dtype_error(dtype: object) -> InvalidValueError:
@@ -98,10 +105,9 @@ def _differentiate(expressions: Sequence[Expression], inputs: Sequence[Symbol]) 
     needed = set().union(*(e.symbols for e in derivatives))
     missing = sorted(map(str, needed.difference(inputs)))
     if missing:
-        listed = ", ".join(f"'{name}'" for name in missing[:12]) + (", ..." if len(missing) > 12 else "")
         raise UnknownNameError(
-            f"The gradients depend on symbols that are not among the inputs: {listed}. Add them, or replace "
-            "them by numbers (substitute)."
+            f"The gradients depend on symbols that are not among the inputs: {name_list(missing)}. Add them, "
+            "or replace them by numbers (substitute)."
         )
     return derivatives
 

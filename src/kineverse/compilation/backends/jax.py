@@ -19,13 +19,13 @@ from kineverse.compilation.c_source import read_source
 from kineverse.compilation.codegen import VECTOR, generate_batch_source, missing_operations
 from kineverse.compilation.program import Program
 from kineverse.compilation.toolchain import vector_optimisation_level
-from kineverse.errors import CompileError, MissingDependencyError, ShapeError
+from kineverse.errors import CompileError, MissingDependencyError
 from kineverse.expressions import ExpressionLike
 from kineverse.expressions.layout import ArrayShape
 from kineverse.symbols import Symbol
 
-from .array_source import array_source
-from .derivatives import DerivativePrograms, check_tier, dtype_error
+from .array_source import load_operations
+from .derivatives import DerivativePrograms, array_error, check_tier, dtype_error
 
 # Raise the number when other source is generated from the same program and texts.
 _KIND = "xla 1 " + hashlib.sha256(
@@ -82,7 +82,6 @@ def to_jax(
     jax = _import_jax()
     check_tier(tier)
     programs = DerivativePrograms(expressions, inputs, "to_jax")
-    single, check_shape = programs.single, programs.check_shape
 
     @cache
     def level(order: int) -> Callable[[Any], list[Any]]:
@@ -98,9 +97,9 @@ def to_jax(
 
     def function(x: Any) -> Any:
         values = _as_array(x)
-        check_shape(values.shape)
+        programs.check_shape(values.shape)
         results = evaluate(values)
-        return results[0] if single else tuple(results)
+        return results[0] if programs.single else tuple(results)
 
     return function
 
@@ -121,10 +120,7 @@ def _as_array(x: Any) -> Any:
     try:
         values = jnp.asarray(x)
     except (TypeError, ValueError):
-        raise ShapeError(
-            f"Expected an array of numbers, not a {type(x).__name__}: the function takes one vector, in the "
-            "order of its inputs."
-        ) from None
+        raise array_error(x) from None
     if jnp.issubdtype(values.dtype, jnp.integer):
         return values.astype(jnp.result_type(float))
     if values.dtype not in (jnp.float32, jnp.float64):
@@ -142,7 +138,10 @@ def _differentiable(
     """Return a function of arrays whose tangents are computed by the next order."""
     jax = _import_jax()
     jnp = jax.numpy
-    in_operations = _in_operations(program, shapes)
+    load = load_operations(program, shapes, m=jnp, erf=jax.lax.erf, erfinv=jax.lax.erf_inv)
+
+    def in_operations(x: Any) -> list[Any]:
+        return load(x.dtype == jnp.float32)(x, x.dtype.type)
 
     def compute(x: Any) -> list[Any]:
         if tier == "operations":
@@ -169,22 +168,6 @@ def _differentiable(
     values.defjvp(differentiate)
     evaluate: Callable[[Any], list[Any]] = values
     return evaluate
-
-
-def _in_operations(program: Program, shapes: tuple[ArrayShape, ...]) -> Callable[[Any], list[Any]]:
-    """Return the function that consists of operations of JAX."""
-    jax = _import_jax()
-    jnp = jax.numpy
-
-    @cache
-    def make(single_precision: bool) -> Callable[[Any, Callable[[float], Any]], list[Any]]:
-        source = array_source(program, shapes, single_precision=single_precision)
-        names: dict[str, Any] = {"m": jnp, "erf": jax.lax.erf, "erfinv": jax.lax.erf_inv}
-        exec(compile(source, "<kineverse operations>", "exec"), names)
-        evaluate: Callable[[Any, Callable[[float], Any]], list[Any]] = names["evaluate"]
-        return evaluate
-
-    return lambda x: make(x.dtype == jnp.float32)(x, x.dtype.type)
 
 
 def _in_c(

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Sequence
-from functools import cache
+from functools import cache, partial
 from typing import Any, Literal
 
 import numpy as np
@@ -21,8 +21,8 @@ from kineverse.expressions import ExpressionLike
 from kineverse.expressions.layout import ArrayShape
 from kineverse.symbols import Symbol
 
-from .array_source import array_source
-from .derivatives import DerivativePrograms, check_tier, dtype_error
+from .array_source import load_operations
+from .derivatives import DerivativePrograms, array_error, check_tier, dtype_error
 
 
 def to_torch(
@@ -72,7 +72,6 @@ def to_torch(
     torch = _import_torch()
     check_tier(tier)
     programs = DerivativePrograms(expressions, inputs, "to_torch")
-    single, check_shape = programs.single, programs.check_shape
 
     @cache
     def level(order: int) -> Any:
@@ -82,9 +81,9 @@ def to_torch(
 
     def function(x: Any) -> Any:
         values = _as_tensor(x)
-        check_shape(values.shape)
+        programs.check_shape(values.shape)
         results = first.apply(values)
-        return results[0] if single else results
+        return results[0] if programs.single else results
 
     # Dynamo cannot look into compiled C, nor trace an operation that has a forward mode.
     return torch.compiler.disable(function)  # type: ignore[no-any-return]
@@ -101,14 +100,21 @@ def _import_torch() -> Any:
 def _as_tensor(x: Any) -> Any:
     import torch
 
+    def has_tensors(x: Any) -> bool:
+        return isinstance(x, torch.Tensor) or (isinstance(x, (list, tuple)) and any(map(has_tensors, x)))
+
+    if not isinstance(x, torch.Tensor) and has_tensors(x):  # PyTorch takes their numbers, and no gradient
+        raise ShapeError(
+            f"Expected one tensor, not a {type(x).__name__} of tensors. Write torch.stack(values, dim=-1)."
+        )
     try:
+        if isinstance(x, np.ma.MaskedArray):  # PyTorch takes what is masked for numbers
+            raise TypeError
         values = torch.as_tensor(x)
     except (TypeError, ValueError, RuntimeError):
-        raise ShapeError(
-            f"Expected a tensor, not a {type(x).__name__}: the function takes one vector, in the order "
-            "of its inputs."
-        ) from None
-    if values.dtype in (torch.int8, torch.int16, torch.int32, torch.int64, torch.uint8):
+        raise array_error(x) from None
+    whole = not (values.is_floating_point() or values.is_complex() or values.dtype == torch.bool)
+    if whole:
         return values.to(torch.get_default_dtype())
     if values.dtype not in (torch.float32, torch.float64):
         raise dtype_error(values.dtype)
@@ -122,7 +128,11 @@ def _differentiable(
     import torch
 
     on_host = None if tier == "operations" else _on_host(program, shapes, tier)
-    in_operations = _in_operations(program, shapes)
+    load = load_operations(program, shapes, m=torch, erf=torch.erf, erfinv=torch.erfinv)
+
+    def in_operations(x: Any) -> list[Any]:
+        constant = partial(torch.full, (), dtype=x.dtype, device=x.device)
+        return load(x.dtype == torch.float32)(x, constant)
 
     class Evaluate(torch.autograd.Function):  # type: ignore[misc]
         @staticmethod
@@ -146,8 +156,9 @@ def _differentiable(
         def backward(ctx: Any, *weights: Any) -> Any:
             (x,) = ctx.saved_tensors
             slopes = following().apply(x)[count:]
+            # Not as matrices: their products have few digits with autocast, and on a GPU with TF32.
             terms = [
-                (weight.reshape((*x.shape[:-1], 1, math.prod(shape))) @ _matrix(slope, x)).squeeze(-2)
+                (slope * weight.unsqueeze(-1)).reshape((*x.shape[:-1], math.prod(shape), x.shape[-1])).sum(-2)
                 for shape, slope, weight in zip(shapes, slopes, weights, strict=True)
                 if weight is not None
             ]
@@ -158,7 +169,7 @@ def _differentiable(
             (x,) = ctx.saved_tensors
             slopes = following().apply(x)[count:]
             return tuple(
-                (_matrix(slope, x) @ v.unsqueeze(-1)).reshape((*x.shape[:-1], *shape))
+                (slope * v.reshape((*v.shape[:-1], *(1,) * len(shape), v.shape[-1]))).sum(-1)
                 for shape, slope in zip(shapes, slopes, strict=True)
             )
 
@@ -170,32 +181,6 @@ def _differentiable(
     return Evaluate
 
 
-def _matrix(slope: Any, x: Any) -> Any:
-    """Return derivatives with one row for each element of the output."""
-    count = math.prod(slope.shape[x.ndim - 1 : -1])
-    return slope.reshape((*x.shape[:-1], count, x.shape[-1]))
-
-
-def _in_operations(program: Program, shapes: tuple[ArrayShape, ...]) -> Callable[[Any], list[Any]]:
-    """Return the function that consists of operations of PyTorch."""
-    import torch
-
-    @cache
-    def make(single_precision: bool) -> Callable[[Any, Callable[[float], Any]], list[Any]]:
-        source = array_source(program, shapes, single_precision=single_precision)
-        names = {"m": torch, "erf": torch.erf, "erfinv": torch.erfinv}
-        exec(compile(source, "<kineverse operations>", "exec"), names)
-        evaluate: Callable[[Any, Callable[[float], Any]], list[Any]] = names["evaluate"]
-        return evaluate
-
-    def evaluate(x: Any) -> list[Any]:
-        return make(x.dtype == torch.float32)(
-            x, lambda number: torch.full((), number, dtype=x.dtype, device=x.device)
-        )
-
-    return evaluate
-
-
 def _on_host(program: Program, shapes: tuple[ArrayShape, ...], tier: str) -> Callable[[Any], tuple[Any, ...]]:
     """Return the function of tensors on the CPU, whose memory is that of arrays."""
     import torch
@@ -205,8 +190,8 @@ def _on_host(program: Program, shapes: tuple[ArrayShape, ...], tier: str) -> Cal
 
     def evaluate(x: Any) -> tuple[Any, ...]:
         leading, size = x.shape[:-1], x.shape[-1]
-        rows = x.detach().reshape(-1, size) if size else x.detach()
-        results = batch(rows.numpy(), None, interpreted)
+        rows = x.reshape(-1, size).numpy(force=True)  # force: x may be a view of negated memory
+        results = batch(rows, None, interpreted)
         return tuple(
             torch.from_numpy(np.asarray(result)).reshape((*leading, *shape)).to(x.dtype)
             for result, shape in zip(results, shapes, strict=True)

@@ -211,7 +211,8 @@ class Calibration:
             lines.append(f"{group}: {', '.join(parts)}")
         if self.outliers:
             looks = sorted({outlier.look for outlier in self.outliers})
-            lines.append(f"{len(self.outliers)} gross errors, in looks {list_some(looks, 12)}")
+            errors = "1 gross error" if len(self.outliers) == 1 else f"{len(self.outliers)} gross errors"
+            lines.append(f"{errors}, in {'look' if len(looks) == 1 else 'looks'} {list_some(looks, 12)}")
         alone = [name for one in self.unobservable if len(one) == 1 for name in one]
         lines += [f"not told by the data: {', '.join(alone)}"] if alone else []
         lines += [f"not told by the data: {format_direction(d)}" for d in self.unobservable if len(d) > 1]
@@ -311,7 +312,8 @@ def calibrate(
             "No observation depends on what is free: "
             f"{list_some((str(u.outer) for u in unknowns), 6)}. Free something between the observed frames."
         )
-    fit = problem.solve(_start(problem, prepared, place, present) / scales, present / scales)
+    starts = [start / scales for start in _starts(problem, prepared, place, present)]
+    fit = problem.solve(starts, present / scales)
     sizes = ", ".join(format_size(size, name) for name, size in fit.noise.items())
     check_explained(problem, fit, sizes)
     return _result(model, prepared, problem, fit, before, folds)
@@ -454,31 +456,17 @@ def _size(block: ResidualBlock) -> int:
     return max(int(group.rows.stop) for group in block.groups)
 
 
-def _start(
+def _starts(
     problem: CalibrationProblem, prepared: _Prepared, place: Mapping[Symbol, int], present: Array
-) -> Array:
-    """Return the start: the present values, or mounts in closed form if they fit better."""
+) -> list[Array]:
+    """Return the present values, and those with mounts in closed form."""
     mounts = [[place[s] for s in c.symbols] for c in prepared.corrections if c.word == "mount"]
     poses = [
         (block, columns.tolist())
         for block, columns in zip(problem.blocks, problem.columns, strict=True)
         if isinstance(block, CompiledBlock) and block.kind == "pose"
     ]
-    if not mounts or not poses:
-        return present
-    closed = start_mounts(poses, mounts, present)
-    return min((present, closed), key=lambda x: _misfit(problem, x / problem.scales))
-
-
-def _misfit(problem: CalibrationProblem, values: Array) -> float:
-    """Return a measure of the median residuals, free of units up to a constant."""
-    linear = problem.linearise(values)
-    noise = problem.median_noise(linear)
-    total = sum(map(math.log, noise.values()))
-    for i, square in enumerate(problem.squares(linear, noise)):
-        if problem.whiten[i] is not None:
-            total += 0.5 * math.log(max(float(np.median(square)), 1e-30))
-    return total
+    return [present, start_mounts(poses, mounts, present)] if mounts and poses else [present]
 
 
 def _result(

@@ -1,10 +1,11 @@
 """Robust least squares of all residual blocks: Gauss-Newton steps, outliers, and sizes of the noise.
 
 The first steps weigh observations by a Cauchy density whose scale is the median of the residuals, from which
-a start far away and a share of gross errors below one half converge. Then the mixture of
-:class:`.Outliers` weighs them, and the sizes of the noise are those at which the weighted residuals of each
-group have the variance expected with its share of the degrees of freedom (restricted maximum likelihood),
-with the prior of unknown noise that identification has.
+a start far away and a share of gross errors below one half converge. Then the mixture of :class:`.Outliers`
+weighs them, and the sizes of the noise are those at which the weighted residuals of each group have the
+variance expected with its share of the degrees of freedom (restricted maximum likelihood), with the prior of
+unknown noise that identification has. With a majority of gross errors, noise as wide as they are may seem to
+fit; its residuals are not normal. Then the scale of the lower quartile is tried too, and the likelier wins.
 
 Parameters are scaled by their prior sizes. In a direction that the data tell less well than its prior size,
 steps are zero: so it stays where it was.
@@ -14,6 +15,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -32,6 +34,17 @@ _ROUGH, _STEPS, _HALVINGS = 40, 60, 8  # largest numbers of steps before and wit
 _SETTLED = 1e-8  # squared length of a step at convergence, in standard deviations
 _NEAR = 1e-2  # the same of the last step before the mixture
 _EVEN = 1e-3  # relative change of the sizes of noise at convergence
+
+
+class Quantile(NamedTuple):
+    """Share of the residuals that sets the scale of a robust step, with its normal deviate."""
+
+    share: float
+    deviate: float
+
+
+_MEDIAN, _QUARTILE = Quantile(0.5, 0.0), Quantile(0.25, -0.67449)
+_PEAKED = 3.0  # standard deviations of a kurtosis above which another solution is looked for
 
 
 class Linearised(NamedTuple):
@@ -151,19 +164,18 @@ class CalibrationProblem:
             cost += float((log_scale - total).sum())
         return weights, cost
 
-    def median_noise(self, linear: Sequence[Linearised]) -> dict[str, float]:
-        """Return sizes of the noise by the median residual of each group; at least the known ones."""
+    def robust_noise(self, linear: Sequence[Linearised], quantile: Quantile) -> dict[str, float]:
+        """Return sizes of the noise by a quantile of the residuals of each group; at least the known ones."""
         norms: dict[str, list[Array]] = {}
         for i, one in enumerate(linear):
             if self.whiten[i] is None:
                 for group in self.blocks[i].groups:
                     part = one.residual[:, group.rows]
-                    norms.setdefault(group.name, []).append(
-                        np.square(part).sum(axis=1) / _median(part.shape[1])
-                    )
+                    squares = np.square(part).sum(axis=1) / _chi_square(part.shape[1], quantile.deviate)
+                    norms.setdefault(group.name, []).append(squares)
         result = {}
-        for name, squares in norms.items():
-            size = math.sqrt(float(np.median(np.concatenate(squares))))
+        for name, parts in norms.items():
+            size = math.sqrt(float(np.quantile(np.concatenate(parts), quantile.share)))
             result[name] = max(size, self.known.get(name, FINEST))
         return result
 
@@ -194,12 +206,33 @@ class CalibrationProblem:
 
     # -- solutions ---------------------------------------------------------------------------------------
 
-    def solve(self, start: Array, present: Array) -> CalibrationFit:
-        """Return the most likely parameters from a start; those that nothing tells are the present ones."""
-        values, linear = self._approach(self._nearest_start(start))
+    def solve(self, starts: Sequence[Array], present: Array) -> CalibrationFit:
+        """Return the most likely parameters from starts; those that nothing tells are the present ones."""
+        fit = self._solve(self._nearest_start(starts), present, _MEDIAN)
+        if self.outliers and self._is_peaked(fit):
+            # Noise as wide as a majority of gross errors would pass for what fits.
+            with suppress(NoSolutionError):
+                other = self._solve(fit.values, present, _QUARTILE)
+                fit = min(fit, other, key=lambda one: self.mixture(one.linear, one.noise)[1])
+        return fit
+
+    def _is_peaked(self, fit: CalibrationFit) -> bool:
+        """Return True for inliers that are not normal: more are near and far (Mardia's kurtosis, 1970)."""
+        excess = variance = 0.0
+        for square, weights, one in zip(
+            self.squares(fit.linear, fit.noise), fit.weights, fit.linear, strict=True
+        ):
+            rows = one.residual.shape[1]
+            excess += float(weights @ (square**2 - rows * (rows + 2)))
+            variance += 8 * rows * (rows + 2) * float(weights.sum())
+        return excess > _PEAKED * math.sqrt(variance)
+
+    def _solve(self, start: Array, present: Array, quantile: Quantile) -> CalibrationFit:
+        """Return the most likely parameters near a start, first at the scale of a quantile of residuals."""
+        values, linear = self._approach(start, quantile)
         # From above, so that no observation of few is lost at once.
-        noise = {n: max(size, self.medians.get(n, 0.0)) for n, size in self.median_noise(linear).items()}
-        noise |= self.known
+        sizes = self.robust_noise(linear, quantile)
+        noise = {name: max(size, self.medians.get(name, 0.0)) for name, size in sizes.items()} | self.known
         weights, cost = self.mixture(linear, noise)
         for _ in range(_STEPS):
             equations = self.normal_equations(linear, weights, noise)
@@ -222,20 +255,25 @@ class CalibrationProblem:
         hessian = self.normal_equations(linear, weights, noise).hessian
         return CalibrationFit(values, noise, weights, linear, hessian, pseudo_inverse(hessian)[1])
 
-    def _nearest_start(self, start: Array) -> Array:
-        """Return a start with the values that blocks propose, of each block that fits better by its own."""
-        best, spread = start, self._spread(start)
+    def _nearest_start(self, starts: Sequence[Array]) -> Array:
+        """Return the best start, with the values that blocks propose where these fit better."""
+        best = min(starts, key=self._misfit)
         for block, columns in zip(self.blocks, self.columns, strict=True):
             if block.start is not None:
                 proposed = best.copy()
                 proposed[columns] = block.start / self.scales[columns]
-                if (reached := self._spread(proposed)) < spread:
-                    best, spread = proposed, reached
+                best = min(best, proposed, key=self._misfit)
         return best
 
-    def _spread(self, values: Array) -> float:
-        """Return the sum of the logarithms of the median residuals of all groups."""
-        return float(np.log([*self.median_noise(self.linearise(values)).values()]).sum())
+    def _misfit(self, values: Array) -> float:
+        """Return a measure of the median residuals, free of units up to a constant."""
+        linear = self.linearise(values)
+        noise = self.robust_noise(linear, _MEDIAN)
+        total = sum(map(math.log, noise.values()))
+        for whiten, square in zip(self.whiten, self.squares(linear, noise), strict=True):
+            if whiten is not None:
+                total += 0.5 * math.log(max(float(np.median(square)), FINEST**2))
+        return total
 
     def refit(self, fit: CalibrationFit, keep: Sequence[Array]) -> Array:
         """Return the parameters from some of the observations, at the weights and the noise of a fit."""
@@ -270,16 +308,17 @@ class CalibrationProblem:
             linear = self.linearise(values)
         return values, linear
 
-    def _approach(self, values: Array) -> tuple[Array, list[Linearised]]:
-        """Go near the solution by Cauchy weights at the scale of the median."""
+    def _approach(self, values: Array, quantile: Quantile) -> tuple[Array, list[Linearised]]:
+        """Go near the solution by Cauchy weights at the scale of a quantile."""
         linear = self.linearise(values)
         for _ in range(_ROUGH):
-            noise = self.median_noise(linear)
+            noise = self.robust_noise(linear, quantile)
             weights = []
             for i, square in enumerate(self.squares(linear, noise)):
                 size = linear[i].residual.shape[1]
                 if self.whiten[i] is not None:
-                    square = square / max(float(np.median(square)) / _median(size), 1.0)
+                    scale = float(np.quantile(square, quantile.share)) / _chi_square(size, quantile.deviate)
+                    square = square / max(scale, 1.0)
                 weights.append((1 + size) / (1 + square) if self.outliers else np.ones(len(square)))
             equations = self.normal_equations(linear, weights, noise)
             step, _ = gauss_newton_step(equations)
@@ -355,9 +394,9 @@ def _likely_size(square: float, freedom: float, median: float | None) -> float:
     return math.exp(log)
 
 
-def _median(size: int) -> float:
-    """Return the median of χ² with some degrees of freedom (Wilson and Hilferty)."""
-    return size * (1 - 2 / (9 * size)) ** 3
+def _chi_square(size: int, deviate: float) -> float:
+    """Return a quantile of χ² with some degrees of freedom, by that of a normal (Wilson and Hilferty)."""
+    return size * (1 - 2 / (9 * size) + deviate * math.sqrt(2 / (9 * size))) ** 3
 
 
 def check_residuals(linear: Sequence[Linearised], blocks: Sequence[ResidualBlock]) -> None:

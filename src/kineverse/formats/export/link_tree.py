@@ -207,6 +207,7 @@ class LinkTreeBuilder:
         if self._carriers:
             links += self._carrier_links(chains, set(independent), links)
         description = RobotDescription(links, self.model.bodies.get(WORLD, NO_BODY), loops=self._loops)
+        self._check_leaders(description)
         simple = list(self._expressible_constraints(found, approximation))
         assign_limits(description, simple, self.capabilities, self.unsupported)
         if approximation is not None and len(chains) == len(decomposed):
@@ -216,6 +217,16 @@ class LinkTreeBuilder:
         self._add_remarks()
         description.remarks = self.remarks
         return description
+
+    def _check_leaders(self, description: RobotDescription) -> None:
+        """Refuse joints that follow what is the position of no joint, such as a number of a quaternion."""
+        known = {joint.symbol for joint in description.joints if joint.is_independent} | self._refused_symbols
+        for joint in () if self._loose else description.joints:
+            if joint.symbol not in known:
+                target = self.capabilities.name
+                self.unsupported.refuse(
+                    joint.name, f"follows '{joint.symbol}', which is the position of no joint in {target}"
+                )
 
     def _expressible_constraints(
         self,

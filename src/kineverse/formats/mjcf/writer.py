@@ -41,7 +41,6 @@ MJCF_CAPABILITIES = FormatCapabilities(
     "MJCF", sum_limits=True, one_way_speeds=True, loop_joints=True, polynomial_degree=4
 )
 
-_AXES = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 _MAX_BODY_DOFS = 6
 _ARMATURE = 1e-3  # armature [kg m²] or [kg] of dependent joints in such links; avoids singular inertia
 _TIE_SOLREF, _TIE_SOLIMP = (0.004, 1.0), (0.99, 0.999, 0.001)
@@ -159,7 +158,7 @@ class MjcfWriter:
     def _link(self, link: LinkDescription) -> None:
         """Add the body of a link, and intermediate bodies if it has more joints than a body may have."""
         check_rotation(link, self._unsupported)
-        if link.dynamics and self._freejoint_name(link) is None:
+        if link.dynamics and not self._freejoint_name(link):
             self._description.remarks.append(
                 f"'{link.name}' is moved by several joints in MJCF: "
                 f"the {' and '.join(link.dynamics)} of all is left out"
@@ -181,7 +180,7 @@ class MjcfWriter:
         self, body: Tag, link: LinkDescription, joints: Iterable[JointDescription | BallJointDescription]
     ) -> None:
         free = self._freejoint_name(link)
-        if free is not None:
+        if free:
             if link.dynamics:
                 self._dynamics(body.add("joint", name=free, type="free"), free, link.dynamics)
             else:
@@ -202,20 +201,12 @@ class MjcfWriter:
                         body.inside[-1].give("armature", _ARMATURE)
                     self._qpos.append(self._home_position(joint))
 
-    def _freejoint_name(self, link: LinkDescription) -> str | None:
-        if link.parent != WORLD or len(link.joints) != 4:
-            return None
-        *slides, ball = link.joints
-        if not isinstance(ball, BallJointDescription) or any(ball.point) or ball.dynamics:
-            return None
-        for joint, axis, c in zip(slides, _AXES, "xyz", strict=True):
-            if not isinstance(joint, JointDescription) or joint.is_rotation or joint.axis != axis:
-                return None
-            if joint.name != f"{ball.name}/{c}" or not joint.is_independent:
-                return None
-            if joint.dynamics or not joint.bounds.is_unbounded:
-                return None
-        return ball.name
+    def _freejoint_name(self, link: LinkDescription) -> str:
+        free = link.free_motion if link.parent == WORLD else ""
+        if not free or self._description.has_followers(link):
+            return ""
+        slides = [joint for joint in link.joints if isinstance(joint, JointDescription)]
+        return free if all(joint.bounds.is_unbounded for joint in slides) else ""
 
     def _append_free_home(self, link: LinkDescription, name: str) -> None:
         """Add the home position of a free body to the key; MuJoCo measures it in the world."""

@@ -146,7 +146,7 @@ class _Reader:
             if not any(direction):
                 self._refuse("the direction of its axis is 0")
             limit = self._limit(self._object(data.get("limit", {}), "limit"), joint)
-        meshes = tuple(self._meshes(folder, objs)) if objs is not None else ()
+        meshes = tuple(dict.fromkeys(self._meshes(folder, objs))) if objs is not None else ()
         return PartNetPart(number, parent, name, joint, origin, direction, limit, meshes)
 
     def _limit(self, limit: Mapping[str, Any], kind: PartNetJointKind) -> PartNetLimit:

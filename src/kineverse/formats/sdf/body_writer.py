@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from kineverse.errors import list_some
 from kineverse.formats.description import Matrix
 from kineverse.formats.names import TakenNames
 from kineverse.formats.poses import rpy_angles
@@ -59,9 +60,7 @@ class SdfBodyWriter:
     def finish(self) -> None:
         """Add the remark on links that have no mass in the model."""
         if self._massless:
-            self._remark(
-                f"{len(self._massless)} links without mass have {_MASS:g} kg in SDF, which knows none without"
-            )
+            self._remark(f"SDF has no links without mass: {list_some(self._massless, 4)} weigh {_MASS:g} kg")
 
     def _inertia(self, link: Tag, inertia: Inertia | None, name: str) -> None:
         element = link.add("inertial")

@@ -22,7 +22,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from kineverse.formats.names import drop_empty_parts
+from kineverse.formats.names import NameMap, drop_empty_parts
 from kineverse.formats.poses import pose_from_quaternion
 from kineverse.formats.reader_warnings import ReaderWarnings
 from kineverse.formats.xml_reader import Element, ElementError
@@ -68,14 +68,17 @@ def read_values(element: Element, key: str, count: int, remarks: ReaderWarnings)
     if text is None:
         return ()
     try:
-        return parse_numbers(text, count)
+        values = parse_numbers(text, count)
+        if key != INERTIA and count in (4, 7) and not any(values[-4:]):
+            raise ValueError("has the quaternion 0 0 0 0, which is no orientation")
+        return values
     except ValueError as error:
         remarks.repair(ElementError(element, f"has {key}, which {error}."), "it is ignored")
         return ()
 
 
-def read_loop(element: Element, remarks: ReaderWarnings) -> SdfLoop | None:
-    """Return the loop that a joint states to close."""
+def read_loop(element: Element, remarks: ReaderWarnings, model_name: NameMap) -> SdfLoop | None:
+    """Return the loop that a joint states to close, with names below that of its scope."""
     text = element[1].get(LOOP)
     if text is None:
         return None
@@ -83,7 +86,7 @@ def read_loop(element: Element, remarks: ReaderWarnings) -> SdfLoop | None:
         known = json.loads(text)
         name, dependent = drop_empty_parts(known["name"]), known["dependent"]
         if name and (dependent is None or all(isinstance(one, str) and one for one in dependent)):
-            return SdfLoop(name, None if dependent is None else tuple(dependent))
+            return SdfLoop(model_name(name), None if dependent is None else tuple(map(model_name, dependent)))
     except (ValueError, TypeError, KeyError, AttributeError, RecursionError):
         pass
     remarks.add(element, f"has {LOOP}, which is no record of a loop; it is ignored.")

@@ -72,7 +72,7 @@ def read_sdf_joint(node: PoseNode, attachments: dict[PoseNode, PoseNode]) -> Res
         home: tuple[float, ...] = ()
         if kind in COORDINATE_COUNT:
             home = read_values(element, HOME, COORDINATE_COUNT[kind], document.remarks)
-        loop = read_loop(element, document.remarks)
+        loop = read_loop(element, document.remarks, node.scope.path_of_model_name)
     parent_T_joint = pose_between(parent, node)
     if zero:
         xyz, turns = (axes[0].xyz if axes else (0.0, 0.0, 1.0)), kind != "prismatic"

@@ -237,12 +237,12 @@ def _check_names(scene: SdfScene) -> None:
     articulations: dict[str, str] = {}
 
     def take(taken: dict[str, str], name: str, what: str, part: SdfLink | SdfFrame | SdfJoint) -> None:
-        other = taken.setdefault(name, f"{what} of line {part.line}")
-        if other != f"{what} of line {part.line}" or not name:
+        if name in taken:
             raise FormatError(
-                f"{part.source}, line {part.line}: {what} would be called {quote(name)} here, as {other} is. "
-                "Rename one of them."
+                f"{part.source}, line {part.line}: {what} would be called {quote(name)} here, as "
+                f"{taken[name]} is. Rename one of them."
             )
+        taken[name] = f"{what} of line {part.line}"
 
     for link in scene.links:
         take(frames, link.name, "the link", link)

@@ -66,7 +66,6 @@ _DYNAMICS = {
     "spring_stiffness": ("spring_stiffness", "stiffness"),
 }
 _KNOWN = frozenset(("effort", *(key for keys in _DYNAMICS.values() for key in keys)))
-_SPACE = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 _QUATERNION = ("qx", "qy", "qz", "qw")
 _UNTURNED = (0.0, 0.0, 0.0, 1.0)
 _PERPENDICULAR = 1e-9  # largest cosine of the axes of a universal joint; drake takes 1e-9 as well
@@ -158,7 +157,7 @@ class SdfWriter:
 
     def _plan(self, link: LinkDescription) -> list[_SdfJoint]:
         """Return the joints of a link, and assign the names of their coordinates."""
-        if self._free_name(link) is not None:
+        if self._free_name(link):
             return []
         planned = list(_merge_joints(link, self._looped))
         for joint in planned:
@@ -200,7 +199,7 @@ class SdfWriter:
             )
         planned, parent, pose = self._joints[id(link)], link.parent, link.pose
         free = self._free_name(link)
-        if free is not None:
+        if free:
             self._free_link(link, free)
             return
         if not planned:
@@ -239,27 +238,17 @@ class SdfWriter:
         if joint.attributes["name"] != wanted:
             joint.attributes[NAME] = wanted
 
-    def _free_name(self, link: LinkDescription) -> str | None:
-        """Return the name of the free motion of a link in the world; None if it has no such motion."""
-        if link.parent != WORLD or len(link.joints) != 4:
-            return None
-        *slides, ball = link.joints
-        if not isinstance(ball, BallJointDescription) or any(ball.point) or ball.dynamics:
-            return None
-        for joint, (c, axis) in zip(slides, _SPACE.items(), strict=True):
-            if not isinstance(joint, JointDescription) or joint.is_rotation or joint.axis != axis:
-                return None
-            if joint.name != f"{ball.name}/{c}" or not joint.is_independent or joint.dynamics:
-                return None
-            if joint.bounds != JointBounds():
-                return None
-        coordinates = {f"{ball.name}/{c}" for c in _SPACE}
-        followers = {j.symbol.path for j in self._description.joints if not j.is_independent}
-        is_coupled = not coordinates.isdisjoint(followers) or not coordinates.isdisjoint(self._looped)
-        return None if is_coupled else ball.name
+    def _free_name(self, link: LinkDescription) -> str:
+        """Return the name of the free motion of a link in the world; empty if it has no such motion."""
+        free = link.free_motion if link.parent == WORLD else ""
+        if not free or self._description.has_followers(link):
+            return ""
+        slides = [joint for joint in link.joints if isinstance(joint, JointDescription)]
+        is_plain = all(j.bounds == JointBounds() and j.name not in self._looped for j in slides)
+        return free if is_plain else ""
 
     def _free_link(self, link: LinkDescription, free: str) -> None:
-        values = [self._home.get(f"{free}/{c}", 0.0) for c in (*_SPACE, *_QUATERNION)]
+        values = [self._home.get(f"{free}/{c}", 0.0) for c in ("x", "y", "z", *_QUATERNION)]
         motion = pose_from_quaternion(tuple(values[:3]), tuple(values[3:])).matrix
         element = self._add_link(link.name, self._frames[link.name], link.pose @ motion, WORLD)
         element.attributes[FREE] = free
@@ -323,10 +312,7 @@ class SdfWriter:
     def _mimic(self, element: Tag, joint: JointDescription, shift: float) -> None:
         known = self._axes.get(joint.symbol.path)
         if known is None:
-            self._unsupported.refuse(
-                joint.name, f"follows '{joint.symbol}', which is the position of no joint in SDF"
-            )
-            return
+            return  # what it follows is refused
         offset, factor = (*joint.coefficients, 0.0)[:2]
         leader, axis = known
         mimic = element.add("mimic", joint=leader, axis=None if axis == "axis" else axis)
@@ -401,7 +387,7 @@ class _SdfJoint:
         if not self.is_independent:
             return ()
         values = tuple(home.get(axis.symbol.path, 0.0) for axis in self.axes)
-        default = tuple(min(max(0.0, axis.bounds.lower), axis.bounds.upper) for axis in self.axes)
+        default = tuple(axis.bounds.home for axis in self.axes)
         return values if values != default else ()
 
 

@@ -9,10 +9,10 @@ the model no longer has is not written.
 
 from __future__ import annotations
 
+import html
 import re
 from collections.abc import Container, Iterable, Iterator, Mapping
 from typing import Any
-from xml.sax.saxutils import unescape
 
 import msgspec
 from msgspec import Struct
@@ -155,36 +155,38 @@ def find_occurring(elements: Iterable[KeptElement], names: Iterable[str]) -> tup
     """Return the names that are values of attributes or texts in some element."""
     words: set[str] = set()
     for element in elements:
-        words.update(map(_plain, _WORDS.findall(element.text)))
+        words.update(map(html.unescape, _WORDS.findall(element.text)))
     return tuple(name for name in names if name in words)
 
 
 def find_references(text: str) -> Iterator[tuple[int, int, str]]:
     """Yield the places and values of attributes and texts of an element that may name links and joints."""
+    is_reference = False  # True if the text of the open element is one
     for token in _TOKEN.finditer(text):
-        tag, attributes = token["tag"], token["attributes"]
-        if tag is None or token["end"] is not None:
+        tag, named = token["tag"], ""
+        if token["end"] is not None:
+            is_reference = False
             continue
-        named = ""
-        for found in _ATTRIBUTE.finditer(attributes):
+        for found in _ATTRIBUTE.finditer(token["attributes"] or ""):
             group = 2 if found[2] is not None else 3
             named = found[group] if found[1] == "name" else named
             if _REFERRING.search(tag if found[1] in ("name", "value") else found[1]):
                 at = token.start("attributes")
-                yield at + found.start(group), at + found.end(group), _plain(found[group])
+                yield at + found.start(group), at + found.end(group), html.unescape(found[group])
+        if tag is not None:  # else a comment, behind which the text goes on
+            is_open = not token["attributes"].endswith("/")
+            is_reference = is_open and _REFERRING.search(f"{tag} {named}") is not None
         inside = _TEXT.match(text, token.end())
-        if inside and inside[0].strip() and _REFERRING.search(f"{tag} {named}"):
+        if is_reference and inside and inside[0].strip():
             word = inside[0].strip()
             begin = inside.start() + inside[0].index(word)
-            yield begin, begin + len(word), _plain(word)
+            yield begin, begin + len(word), html.unescape(word)
 
 
 def _name(attributes: str) -> str:
-    return next((_plain(m[2] or m[3] or "") for m in _ATTRIBUTE.finditer(attributes) if m[1] == "name"), "")
-
-
-def _plain(text: str) -> str:
-    return unescape(text, {"&quot;": '"', "&apos;": "'"})
+    return next(
+        (html.unescape(m[2] or m[3] or "") for m in _ATTRIBUTE.finditer(attributes) if m[1] == "name"), ""
+    )
 
 
 def has_unknown_parts(element: Element) -> bool:
@@ -255,7 +257,7 @@ class KeptPartsWriter:
                     lost.setdefault(missing, []).append(_tag(element.text))
             for name, tags in lost.items():
                 shown = ", ".join(f"<{tag}>" for tag in dict.fromkeys(tags))
-                yield f"{shown} of the file that was read, which is about '{name}', is left out: that is gone"
+                yield f"'{name}' is gone, and so is what the URDF that was read says of it: {shown}"
 
     @staticmethod
     def _name(prefix: str, parts: KeptParts, name: str) -> str:
@@ -291,7 +293,7 @@ def _renamed(text: str, mapping: Mapping[str, str], prefix: str) -> str:
             start = token.start("attributes") + found.start(group)
             if found[1] == "name" and all(start != begin for begin, _, _ in changes):
                 end = token.start("attributes") + found.end(group)
-                changes = [*changes, (start, end, prefix + _plain(found[group]))]
+                changes = [*changes, (start, end, prefix + html.unescape(found[group]))]
     for start, end, new in sorted(changes, reverse=True):
         text = text[:start] + escape_attribute(new) + text[end:]
     return text

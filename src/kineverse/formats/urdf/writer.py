@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import os
 import sys
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,7 @@ import numpy as np
 from msgspec.structs import replace
 
 from kineverse.articulations.multi_axis import rotation_from_z
+from kineverse.errors import list_some
 from kineverse.formats.description import (
     IDENTITY_COEFFICIENTS,
     BallJointDescription,
@@ -176,7 +177,6 @@ LARGEST_FLOAT = sys.float_info.max  # number written in place of no limit, where
 
 _NEWER = ("acceleration", "deceleration", "jerk")
 _KNOWN = frozenset(("effort", "damping", "friction", "k_position", "k_velocity", *_NEWER))
-_SPACE = (("x", (1.0, 0.0, 0.0)), ("y", (0.0, 1.0, 0.0)), ("z", (0.0, 0.0, 1.0)))
 
 
 def to_urdf(
@@ -196,10 +196,28 @@ def to_urdf(
     description = builder.build()
     if loose:
         _loosen_links(description)
+    elif lost := list(_lost_homes(description, builder.home_positions())):
+        description.remarks.append(
+            f"URDF has no default positions: those of {list_some(lost, 4)} are left out"
+        )
     kept = KeptPartsWriter({} if loose else model.data)
     content = UrdfWriter(description, path, builder.unsupported, kept).document()
     check_readable(content, path)
     return WrittenFile(content, tuple(description.remarks), description.errors, builder.unsupported.left_out)
+
+
+def _lost_homes(description: RobotDescription, home: Mapping[Symbol, float]) -> Iterator[str]:
+    """Yield the joints that a reader of URDF has elsewhere by default than at home."""
+    values = {symbol.path: value for symbol, value in home.items()}
+    for link in description.links:
+        for joint in link.joints:
+            if isinstance(joint, BallJointDescription):
+                if any(values.get(f"{joint.name}/{c}", 0.0) for c in ("qx", "qy", "qz")):
+                    yield joint.name
+            elif joint.is_independent and joint.name in values:
+                lower, upper = joint.bounds.soft or (-math.inf, math.inf)
+                if values[joint.name] != min(max(joint.bounds.home, lower), upper):
+                    yield joint.name
 
 
 def _loosen_links(description: RobotDescription) -> None:
@@ -331,21 +349,21 @@ class UrdfWriter:
 
     def _compound(self, link: LinkDescription) -> tuple[str, str, tuple[float, ...] | None] | None:
         """Return name, type and axis of the floating or planar joint that moves a link; None for others."""
-        if len(link.joints) not in (3, 4):
+        if len(link.joints) not in (3, 4) or self._description.has_followers(link):
             return None
         axes = [j for j in link.joints if isinstance(j, JointDescription)]
         if any(not j.is_independent or j.dynamics or j.bounds.soft is not None for j in axes):
             return None
         names, bounds = [j.name for j in axes], [j.bounds for j in axes]
-        ball = link.joints[-1]
-        if isinstance(ball, BallJointDescription) and len(axes) == 3 and not any(ball.point):
-            free = [(f"{ball.name}/{c}", False, axis) for c, axis in _SPACE]
-            if bounds != [JointBounds()] * 3 or ball.dynamics:
-                return None
-            return (ball.name, "floating", None) if free == [_axis_key(j) for j in axes] else None
-        if len(axes) != 3 or len(link.joints) != 3:
-            return None
-        if bounds[0] != bounds[1] or bounds[2] != JointBounds() or not bounds[0].max_velocity > 0:
+        if len(link.joints) == 4:
+            free = link.free_motion
+            return (free, "floating", None) if free and bounds == [JointBounds()] * 3 else None
+        if (
+            len(axes) != 3
+            or bounds[0] != bounds[1]
+            or bounds[2] != JointBounds()
+            or not bounds[0].max_velocity > 0
+        ):
             return None
         name, n = names[2].removesuffix("/angle"), axes[2].axis
         rotation = rotation_from_z(n)

@@ -75,8 +75,9 @@ class UsdBodyReader:
         """Return the remarks, with the number of meshes that are left out."""
         if self._meshes:
             self.remarks.append(
-                f"{self._source}: {self._meshes} meshes on the stage are left out: the triangles of a USD "
-                "file are not read. Models that Kineverse wrote refer to the files of their meshes."
+                f"{self._source}: {self._meshes} mesh{'es are' * (self._meshes > 1) or ' is'} left out: the "
+                "triangles of a USD file are not read. Models that Kineverse wrote refer to the files of "
+                "their meshes."
             )
         return self.remarks
 
@@ -109,8 +110,8 @@ class UsdBodyReader:
         kind, axis = str(prim.GetTypeName()), "Z"
 
         def number(name: str) -> float:
-            value = prim.GetAttribute(name).Get()
-            return float(value) if isinstance(value, (int, float)) else math.nan
+            found = number_of(prim, name)
+            return math.nan if found is None else found
 
         form: Geometry
         if kind == "Cube":
@@ -142,6 +143,9 @@ class UsdBodyReader:
         units = self._scene.units
         mass = (number_of(prim, "physics:mass") or 0.0) * units.mass
         if not mass > 0:
+            prims = [prim, *(shape for shape, _ in self._shapes.get(body.path, ()))]
+            if any(number_of(one, f"physics:{key}") for one in prims for key in ("density", "mass")):
+                self._say(body.path, "has a density, or colliders with a mass, which is left out")
             return None
         rows = np.array(self._xforms.GetLocalToWorldTransform(prim)).T
         point = np.array(numbers_of(prim, "physics:centerOfMass", 3) or (0.0, 0.0, 0.0))

@@ -36,12 +36,11 @@ def embed_document(stage: Any, text: str) -> None:
 
 def find_embedded_document(stage: Any) -> EmbeddedDocument | None:
     """Return the document of a stage; None if it has none."""
-    default = stage.GetDefaultPrim()
-    prim = default.GetChild(DOCUMENT_PRIM) if default else None
-    if not prim:
-        return None
-    text = text_of(prim, _DOCUMENT)
-    return None if text is None else EmbeddedDocument(text, text_of(prim, _DIGEST) == stage_digest(stage))
+    for prim in stage.Traverse():
+        text = text_of(prim, _DOCUMENT)
+        if text is not None:
+            return EmbeddedDocument(text, text_of(prim, _DIGEST) == stage_digest(stage))
+    return None
 
 
 def stage_digest(stage: Any) -> str:

@@ -7,6 +7,7 @@ so.
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
@@ -15,7 +16,8 @@ from typing import Any
 
 import numpy as np
 
-from kineverse.errors import FormatError, UnknownNameError, suggest
+from kineverse._checks import finite_number
+from kineverse.errors import FormatError, InvalidValueError, UnknownNameError, suggest
 from kineverse.formats.description import DisjointSets, Matrix
 from kineverse.formats.engines import PoseEngine
 from kineverse.formats.xml_reader import quote
@@ -31,10 +33,11 @@ from kineverse.lie import (
     transform,
     translation,
 )
+from kineverse.model.body import Pose
 from kineverse.model.registry import FrameDeviation
 
 from .pxr_api import ROTATIONS, TRANSLATIONS, open_stage, pxr
-from .scene import IN_WORLD, UsdBody, UsdJoint, UsdScene, read_scene
+from .scene import BALL, IN_WORLD, UsdBody, UsdJoint, UsdScene, read_scene
 
 _TURNS = (rotation_x, rotation_y, rotation_z)
 _FREE = ("x", "y", "z", "qx", "qy", "qz", "qw")
@@ -53,7 +56,8 @@ def stage_poses(
         File of USD.
     coordinates
         Position of each joint by its name [rad], [m]; of a ball ``name/qx`` … ``name/qw``. Joints without
-        one are at 0, those that mimic follow. Joints that close a loop are passed over.
+        one are at 0, those that mimic follow. Joints that close a loop, or move a kinematic body, are passed
+        over.
     roots
         Poses (4, 4) in the world of bodies that no joint carries, by name; by default those on the stage, or
         those of the coordinates of their free motion where the stage names it.
@@ -64,15 +68,19 @@ def stage_poses(
         If the file cannot be read, or its joints are no tree.
     UnknownNameError
         If there is no such coordinate or body.
+    ShapeError, InvalidValueError
+        If a position is not a finite number, or a pose not a rigid transform.
     """
     file = Path(path)
     tree = StagePoses(read_scene(open_stage(file), file.name))
-    for name in coordinates:
-        if name not in tree.coordinates:
+    for name, value in coordinates.items():
+        if not isinstance(name, str) or name not in tree.coordinates:
             raise UnknownNameError(
-                f"No joint of {file.name} has the coordinate {name!r}. {suggest(name, tree.coordinates)}"
+                f"No joint of {file.name} has the coordinate {name!r}. {suggest(str(name), tree.coordinates)}"
             )
-    return tree.at(coordinates, roots)
+        if finite_number(value) is None:
+            raise InvalidValueError(f"The position of '{name}' is a finite number, not {value!r:.60}.")
+    return tree.at(coordinates, {name: Pose.from_matrix(pose).matrix for name, pose in (roots or {}).items()})
 
 
 class StagePoses:
@@ -86,7 +94,10 @@ class StagePoses:
             if near in self.still:
                 self.still.add(far)
         free = [f"{body.free}/{c}" for body in scene.bodies.values() if body.free for c in _FREE]
-        self.coordinates = (*(name for joint in scene.joints for name in _coordinate_names(joint)), *free)
+        self.coordinates = (
+            *(name for joint, *_ in self._order for one in joint.freedoms for name in one.coordinates),
+            *free,
+        )
 
     def at(
         self, coordinates: Mapping[str, float], roots: Mapping[str, Matrix] | None = None
@@ -116,9 +127,10 @@ class StagePoses:
         world = {IN_WORLD: np.eye(4)} | {path: body.pose for path, body in self._scene.bodies.items()}
         found: dict[str, FrameDeviation] = {}
         for joint in self._scene.joints:
-            if joint.is_excluded and not (joint.freedoms and not joint.is_ball):
+            if joint.is_excluded and all(one.kind == BALL for one in joint.freedoms):
                 near, far = world[joint.body0] @ joint.pose0, world[joint.body1] @ joint.pose1
-                angle = 0.0 if joint.is_ball else float(rotation_angle(inverse(near)[:3, :3] @ far[:3, :3]))
+                turn = inverse(near)[:3, :3] @ far[:3, :3]
+                angle = 0.0 if joint.freedoms else float(rotation_angle(turn))
                 found[joint.name] = FrameDeviation(float(np.linalg.norm(near[:3, 3] - far[:3, 3])), angle)
         return found
 
@@ -172,20 +184,20 @@ def positions_on_stage(scene: UsdScene) -> dict[str, float]:
     found: dict[str, float] = {}
     world = {IN_WORLD: np.eye(4)} | {path: body.pose for path, body in scene.bodies.items()}
     for joint in scene.joints:
-        if joint.is_excluded:
-            continue
         near, far = world[joint.body0] @ joint.pose0, world[joint.body1] @ joint.pose1
         motion = inverse(near) @ far
         values: dict[str, float] = {}
         turn = log_so3(motion[:3, :3])
         for freedom in joint.freedoms:
-            if joint.is_ball and freedom.kind in ROTATIONS:
-                names = (f"{freedom.name}/q{c}" for c in "xyzw")
-                values |= dict(zip(names, to_quaternion(motion[:3, :3]).tolist(), strict=True))
+            if freedom.kind == BALL:
+                values |= zip(freedom.coordinates, to_quaternion(motion[:3, :3]).tolist(), strict=True)
             elif freedom.kind in TRANSLATIONS:
                 values[freedom.name] = float(motion[TRANSLATIONS.index(freedom.kind), 3])
             else:
-                values[freedom.name] = float(turn[ROTATIONS.index(freedom.kind)])
+                angle = float(turn[ROTATIONS.index(freedom.kind)])
+                turns = (angle, angle + math.tau, angle - math.tau)  # the one within limits
+                inside = (x for x in turns if freedom.lower - _SAME_PLACE <= x <= freedom.upper + _SAME_PLACE)
+                values[freedom.name] = next(inside, angle)
         alone = replace(joint, mimic=None)
         if np.abs(_motion(alone, values, {}) - motion).max() < _SAME_PLACE:
             found |= values
@@ -197,10 +209,17 @@ def _tree(scene: UsdScene) -> Iterator[tuple[UsdJoint, str, str]]:
     connected = DisjointSets()
     at: dict[str, list[UsdJoint]] = {}
     children: set[str] = set()
-    for joint in scene.joints:
-        if joint.is_excluded:
+    still = [IN_WORLD, *(path for path, body in scene.bodies.items() if body.is_kinematic)]
+    free = [path for path, body in scene.bodies.items() if body.free]
+    for path in (*still, *free):
+        connected.union("world", path or "world")
+    # Those that are excluded from the articulation close loops, unless nothing else carries a body.
+    for joint in sorted(scene.joints, key=lambda joint: joint.is_excluded):
+        if joint.body0 in still and joint.body1 in still:
             continue
         if not connected.union(joint.body0 or "world", joint.body1 or "world"):
+            if joint.is_excluded:
+                continue
             raise FormatError(
                 f"{joint.path} closes a loop. Exclude it from the articulation (excludeFromArticulation)."
             )
@@ -209,7 +228,7 @@ def _tree(scene: UsdScene) -> Iterator[tuple[UsdJoint, str, str]]:
         children.add(joint.body1)
     visited: set[str] = set()
     # First those that nothing carries; where all have parents, at the first of the bodies.
-    for start in (IN_WORLD, *(path for path in scene.bodies if path not in children), *scene.bodies):
+    for start in (*still, *free, *(path for path in scene.bodies if path not in children), *scene.bodies):
         stack = [] if start in visited else [start]
         visited.add(start)
         while stack:
@@ -233,21 +252,13 @@ def _free_pose(body: UsdBody, values: Mapping[str, float]) -> Matrix:
     return result
 
 
-def _coordinate_names(joint: UsdJoint) -> Iterator[str]:
-    for freedom in joint.freedoms:
-        if joint.is_ball and freedom.kind in ROTATIONS:
-            yield from (f"{freedom.name}/q{c}" for c in "xyzw")
-        else:
-            yield freedom.name
-
-
 def _motion(joint: UsdJoint, values: Mapping[str, float], by_path: Mapping[str, UsdJoint]) -> Matrix:
     """Return the motion of a joint: slides first, then the turn."""
     offset, turn = np.zeros(3), np.eye(3)
     for freedom in joint.freedoms:
-        if joint.is_ball and freedom.kind in ROTATIONS:
-            xyzw = [float(values.get(f"{freedom.name}/q{c}", float(c == "w"))) for c in "xyzw"]
-            turn = quaternion(np.array(xyzw))
+        if freedom.kind == BALL:
+            names = zip(freedom.coordinates, (0.0, 0.0, 0.0, 1.0), strict=True)
+            turn = quaternion(np.array([float(values.get(name, rest)) for name, rest in names]))
             continue
         amount = _position(joint, freedom.name, values, by_path)
         if freedom.kind in TRANSLATIONS:

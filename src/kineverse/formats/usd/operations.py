@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
-from itertools import pairwise
 
 import numpy as np
 
@@ -39,7 +38,7 @@ from .bodies import UsdBodyReader
 from .embedded_document import find_embedded_document
 from .kinematics import positions_on_stage
 from .pxr_api import ROTATIONS, TRANSLATIONS, open_stage, refuse_errors
-from .scene import IN_WORLD, UsdFreedom, UsdJoint, UsdScene, read_scene
+from .scene import BALL, IN_WORLD, UsdFreedom, UsdJoint, UsdScene, read_scene
 
 _STILL = 1e-6  # position [rad], [m] on a stage that is 0 in single precision
 
@@ -112,7 +111,8 @@ def _as_sdf(scene: UsdScene, bodies: dict[str, Body], source: str) -> SdfScene:
     joints: list[SdfJoint] = []
     names = {path: link.name for path, link in links.items()} | {IN_WORLD: WORLD}
     stage = positions_on_stage(scene)
-    for joint in scene.joints:
+    # Those that close loops come last, as the tree is made of the first ones that connect.
+    for joint in sorted(scene.joints, key=lambda joint: joint.is_excluded):
         made, more = _joints(joint, names, stage, source)
         joints += made
         between += more
@@ -123,10 +123,7 @@ def _as_sdf(scene: UsdScene, bodies: dict[str, Body], source: str) -> SdfScene:
         remarks.append(f"{source}: the joint {joint.name} {text}")
 
     every = (*links.values(), *between)
-    excluded = {joint.name for joint in scene.joints if joint.is_excluded}
-    # Those that close loops come last, as the tree is made of the first ones that connect.
-    ordered = sorted(joints, key=lambda joint: joint.name in excluded)
-    roots, tree, loops = build_spanning_tree(every, ordered, (), remark)
+    roots, tree, loops = build_spanning_tree(every, joints, (), remark)
     frames = tuple(SdfFrame(f.name, names[f.body], _pose(f.pose), source=source) for f in scene.frames)
     warn(remarks)
     taken = TakenNames([WORLD, *(link.name for link in every), *(frame.name for frame in frames)])
@@ -172,37 +169,28 @@ def _joints(
     if not joint.freedoms:
         return [common], []
     made = [_single(common, joint, freedom, stage) for freedom in joint.freedoms]
-    if len(made) == 1:
-        return made, []
-    links = []
-    for k, (near, far) in enumerate(pairwise(list(made))):
-        link = SdfLink(f"{near.name}/link", source=source)
-        links.append(link)
+    links = [SdfLink(f"{near.name}/link", source=source) for near in made[:-1]]
+    for k, link in enumerate(links):
         made[k] = replace(made[k], child=link.name, pose_in_child=Pose())
-        made[k + 1] = replace(far, parent=link.name, pose_in_parent=Pose())
+        made[k + 1] = replace(made[k + 1], parent=link.name, pose_in_parent=Pose())
     return made, links
 
 
 def _single(common: SdfJoint, joint: UsdJoint, freedom: UsdFreedom, stage: dict[str, float]) -> SdfJoint:
     """Return the joint of one degree of freedom; where the bodies of the stage are is its home."""
-    if joint.is_ball and freedom.kind in ROTATIONS:
-        names, rest = [f"{freedom.name}/q{c}" for c in "xyzw"], [0.0, 0.0, 0.0, 1.0]
-    else:
-        names, rest = [freedom.name], [0.0]
-    there = tuple(stage.get(name, x) for name, x in zip(names, rest, strict=True))
+    rest = (0.0, 0.0, 0.0, 1.0) if freedom.kind == BALL else (0.0,)
+    there = tuple(stage.get(name, x) for name, x in zip(freedom.coordinates, rest, strict=True))
     if np.abs(np.subtract(there, rest)).max() > _STILL:
         common = replace(common, home=there, zero=there)
-    if joint.is_ball and freedom.kind in ROTATIONS:
+    if freedom.kind == BALL:
         return replace(common, name=freedom.name, kind="ball")
     kinds = TRANSLATIONS if freedom.kind in TRANSLATIONS else ROTATIONS
     x, y, z = np.eye(3)[kinds.index(freedom.kind)].tolist()
     lower = freedom.lower if freedom.lower > -np.inf else None
     upper = freedom.upper if freedom.upper < np.inf else None
-    mimic = None if joint.mimic is None else joint.mimic
     velocity = joint.velocity if joint.velocity < np.inf else None
-    axis = SdfAxis((x, y, z), lower, upper, velocity, freedom.dynamics, mimic=mimic)
-    is_bounded = lower is not None or upper is not None
-    kind: SdfJointType = "revolute" if is_bounded else "continuous"
+    axis = SdfAxis((x, y, z), lower, upper, velocity, freedom.dynamics, mimic=joint.mimic)
+    kind: SdfJointType = "continuous" if lower is None and upper is None else "revolute"
     if kinds is TRANSLATIONS:
         kind = "prismatic"
     return replace(common, name=freedom.name, kind=kind, axes=(axis,))

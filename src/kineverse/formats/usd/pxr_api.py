@@ -17,6 +17,7 @@ import numpy as np
 from kineverse._extras import install_command
 from kineverse.errors import FormatError, MissingDependencyError, list_some
 from kineverse.formats.description import Matrix
+from kineverse.formats.files import read_file
 from kineverse.formats.isolation import IsolatedCallError, call_isolated
 from kineverse.formats.poses import unit_quaternion
 from kineverse.lie import quaternion, transform
@@ -101,9 +102,7 @@ def _open_layer(path: Path) -> Any:
     One wrong byte in a binary file may have OpenUSD loop for ever, or crash.
     """
     layers = pxr().Sdf.Layer
-    with path.open("rb") as file:
-        is_binary = file.read(len(_BINARY)) == _BINARY
-    if not is_binary:
+    if not read_file(path).startswith(_BINARY):
         # A layer that is opened by its path may be an older one, which somebody in the process still holds.
         layer = layers.OpenAsAnonymous(str(path))
         if layer is None:
@@ -195,7 +194,6 @@ def numbers_of(prim: Any, attribute: str, count: int) -> tuple[float, ...]:
 
 
 def number_of(prim: Any, attribute: str) -> float | None:
-    """Return the number of an attribute that is authored; None if it is not."""
-    found = prim.GetAttribute(attribute)
-    value = found.Get() if found and found.HasAuthoredValue() else None
+    """Return the number of an attribute, by default that of its schema; None if it has none."""
+    value = prim.GetAttribute(attribute).Get() if prim.HasAttribute(attribute) else None
     return float(value) if isinstance(value, (int, float)) and not np.isnan(value) else None

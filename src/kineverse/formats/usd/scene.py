@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Container, Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NoReturn
 
 import numpy as np
@@ -43,6 +43,7 @@ from .pxr_api import (
 )
 
 IN_WORLD = ""  # path in place of a body's for what is fixed to the world
+BALL = "ball"  # degree of freedom of all three turns together
 
 
 @dataclass(frozen=True)
@@ -58,11 +59,16 @@ class UsdUnits:
 class UsdFreedom:
     """Degree of freedom of a joint: its coordinate, axis, bounds [rad] or [m], and dynamics."""
 
-    kind: str  # transX … rotZ; rotX alone of a ball
+    kind: str  # transX … rotZ, or BALL
     name: str
     lower: float = -math.inf
     upper: float = math.inf
     dynamics: tuple[tuple[str, float], ...] = ()
+
+    @property
+    def coordinates(self) -> tuple[str, ...]:
+        """Return the names of its coordinates: one, or the quaternion of a ball."""
+        return tuple(f"{self.name}/q{c}" for c in "xyzw") if self.kind == BALL else (self.name,)
 
 
 @dataclass(frozen=True)
@@ -76,13 +82,12 @@ class UsdJoint:
     """
 
     path: str
-    name: str
+    name: str  # that of its coordinate; no coordinate's if it is generic
     body0: str
     body1: str
     pose0: Matrix
     pose1: Matrix
     freedoms: tuple[UsdFreedom, ...] = ()
-    is_ball: bool = False
     is_excluded: bool = False  # True if it closes a loop of its articulation
     mimic: MimicRelation[str] | None = None
     velocity: float = math.inf
@@ -204,7 +209,8 @@ class _SceneReader:
                     f"is left out: a {kind.removesuffix('Joint').lower()} joint is none that is read",
                 )
         by_path = {joint.path: joint for joint in joints}
-        order = {str(prim.GetPath()): k for k, prim in enumerate(self._stage.Traverse())}
+        every = self._stage.Traverse(pxr().Usd.TraverseInstanceProxies())
+        order = {str(prim.GetPath()): k for k, prim in enumerate(every)}
         joints = [
             self._checked_mimic(joint, by_path) for joint in sorted(joints, key=lambda j: order[j.path])
         ]
@@ -228,7 +234,7 @@ class _SceneReader:
         )
 
     def _frames(self, bodies: dict[str, UsdBody]) -> Iterator[UsdFrame]:
-        for prim in self._stage.Traverse():
+        for prim in self._stage.Traverse(pxr().Usd.TraverseInstanceProxies()):
             path = str(prim.GetPath())
             name = text_of(prim, NAME)
             if name is None or path in bodies or prim.GetTypeName() != "Xform":
@@ -255,9 +261,12 @@ class _SceneReader:
         if body0 == body1:
             self._say(found.primPath, "is left out: it connects no two bodies")
             return None
-        name = self._joint_names.take(text_of(prim, NAME) or prim.GetName(), str(found.primPath))
+        name = text_of(prim, NAME) or prim.GetName()
         freedoms = tuple(read(found, name))
-        is_single = len(freedoms) == 1 and not isinstance(found, pxr().UsdPhysics.SphericalJointDesc)
+        if not (freedoms and isinstance(found, pxr().UsdPhysics.D6JointDesc)):
+            name = self._joint_names.take(name, str(found.primPath))
+            freedoms = tuple(replace(one, name=name) for one in freedoms)
+        is_single = len(freedoms) == 1 and freedoms[0].kind != BALL
         unit = self._unit(freedoms[0].kind) if is_single else 1.0
         speed = number_of(prim, "newton:velocityLimit") if is_single else None
         dependent = prim.GetAttribute(DEPENDENT).Get() if prim.HasAttribute(DEPENDENT) else None
@@ -269,7 +278,6 @@ class _SceneReader:
             self._local_pose(prim, body0, found.localPose0Position, found.localPose0Orientation),
             self._local_pose(prim, body1, found.localPose1Position, found.localPose1Orientation),
             freedoms,
-            self._is_ball(found),
             found.excludeFromArticulation,
             self._mimic(prim, unit),
             speed * unit if speed is not None and 0 < speed < LARGEST_FLOAT else math.inf,
@@ -305,14 +313,16 @@ class _SceneReader:
 
     def _ball(self, found: Any, name: str) -> Iterator[UsdFreedom]:
         prim = self._stage.GetPrimAtPath(found.primPath)
-        if any((number_of(prim, f"physics:coneAngle{k}Limit") or -1.0) >= 0.0 for k in (0, 1)):
+        if any((number_of(prim, f"physics:coneAngle{k}Limit") or 0.0) >= 0.0 for k in (0, 1)):
             self._say(found.primPath, "has a cone as its limit, which is left out")
-        yield UsdFreedom(ROTATIONS[0], name)
+        yield UsdFreedom(BALL, name)
 
     def _generic(self, found: Any, own: str) -> Iterator[UsdFreedom]:
         prim = self._stage.GetPrimAtPath(found.primPath)
         limits = {_freedom_name(pair.first): pair.second for pair in found.jointLimits}
         drives = {_freedom_name(pair.first): pair.second for pair in found.jointDrives}
+        if "distance" in limits:
+            self._say(found.primPath, "limits a distance, which is left out")
         free: list[UsdFreedom] = []
         for kind in (*TRANSLATIONS, *ROTATIONS):
             limit = limits.get(kind)
@@ -332,22 +342,10 @@ class _SceneReader:
                 prim, "turns about two axes, in an order that UsdPhysics does not state. Write two joints."
             )
         if len(turns) == 3:
-            if any(one.lower > -math.inf or one.upper < math.inf for one in turns):
-                self._say(found.primPath, "limits its three turns, which is left out")
-            free = [
-                *(one for one in free if one.kind in TRANSLATIONS),
-                UsdFreedom(ROTATIONS[0], turns[0].name),
-            ]
+            if any(one != UsdFreedom(one.kind, one.name) for one in turns):
+                self._say(found.primPath, "limits or drives its three turns, which is left out")
+            free = [*(one for one in free if one.kind in TRANSLATIONS), UsdFreedom(BALL, turns[0].name)]
         yield from free
-
-    def _is_ball(self, found: Any) -> bool:
-        physics = pxr().UsdPhysics
-        if not isinstance(found, physics.D6JointDesc):
-            return isinstance(found, physics.SphericalJointDesc)
-        locked = {
-            _freedom_name(pair.first) for pair in found.jointLimits if pair.second.lower > pair.second.upper
-        }
-        return locked.isdisjoint(ROTATIONS)
 
     def _bounds(self, kind: str, lower: float, upper: float) -> tuple[float, float]:
         unit = self._unit(kind)
@@ -407,7 +405,8 @@ class _SceneReader:
             self._refuse(prim, f"follows {quote(joint.mimic.leader)}, which is no joint that is read.")
         kinds = [tuple(freedom.kind[:3] for freedom in each.freedoms) for each in (joint, leader)]
         is_mixed = bool(prim.GetRelationship(LEADER))
-        if (kinds[0] != kinds[1] and not is_mixed) or set(map(len, kinds)) != {1} or joint.is_ball:
+        single = [("rot",), ("tra",)]
+        if not (kinds[0] in single and kinds[1] in single and (kinds[0] == kinds[1] or is_mixed)):
             self._refuse(
                 prim, f"follows {quote(leader.name)}, which is no joint of its type with one coordinate."
             )

@@ -20,7 +20,6 @@ import numpy as np
 from kineverse.errors import FormatError
 from kineverse.formats.description import (
     BallJointDescription,
-    JointBounds,
     JointDescription,
     LinkDescription,
     LoopJoint,
@@ -154,6 +153,10 @@ class _Carrier:
     path: Any
     pose: Matrix
 
+    def at(self, pose: Matrix) -> _Carrier:
+        """Return the carrier of a frame that has a pose in this one."""
+        return _Carrier(self.path, self.pose @ pose)
+
 
 class UsdWriter:
     """Writer of one description.
@@ -186,7 +189,7 @@ class UsdWriter:
         self.home_poses: dict[str, Matrix] = {WORLD: np.eye(4)}
         joints = description.joints
         self._leaders = {j.symbol: j for j in joints if j.is_independent}
-        self._led = {j.symbol for j in joints if not j.is_independent}
+        self._led = {j.symbol.path for j in joints if not j.is_independent}
 
     def stage(self) -> Any:
         """Return the stage without the document."""
@@ -196,7 +199,7 @@ class UsdWriter:
         api.UsdGeom.SetStageMetersPerUnit(stage, 1.0)
         api.UsdGeom.SetStageUpAxis(stage, api.UsdGeom.Tokens.z)
         api.UsdPhysics.SetStageKilogramsPerUnit(stage, 1.0)
-        api.UsdGeom.Scope.Define(stage, self._root.GetPath().AppendChild("joints"))
+        joints = api.UsdGeom.Scope.Define(stage, self._root.GetPath().AppendChild("joints")).GetPrim()
         if not is_empty_body(self._description.world_body):
             world = api.UsdGeom.Xform.Define(stage, self._root.GetPath().AppendChild(WORLD)).GetPrim()
             self._bodies.write(world, self._description.world_body, WORLD, moves=False)
@@ -206,7 +209,7 @@ class UsdWriter:
             self._mimic(joint)
         for loop in self._description.loops:
             self._loop(loop)
-        if self._joint_paths:
+        if joints.GetChildren():
             api.UsdPhysics.ArticulationRootAPI.Apply(self._root)
         self._unsupported.check(self._file)
         self._description.remarks += self._unsupported.remarks
@@ -233,16 +236,16 @@ class UsdWriter:
         if link.is_loose:
             self._api.UsdPhysics.RigidBodyAPI(prim).CreateKinematicEnabledAttr(True)
             return
-        free = self._free_motion(link)
-        if free is not None:
+        free = link.free_motion
+        motion = [f"{free}/{c}" for c in ("x", "y", "z", "qx", "qy", "qz", "qw")]
+        if free and parent.path == self._root.GetPath() and self._led.isdisjoint(motion):
             set_text(prim, FREE, free)
-            home = [self._home[f"{free}/{c}"] for c in ("x", "y", "z", "qx", "qy", "qz", "qw")]
+            home = [self._home[name] for name in motion]
             prim.CreateAttribute(HOME, self._api.Sdf.ValueTypeNames.DoubleArray, True).Set(home)
             return
         if not moves:
-            self._joint(
-                "Fixed", link.fixed_joint_name, parent, self._carriers[link.name], link.pose, np.eye(4)
-            )
+            child = self._carriers[link.name]
+            self._joint("Fixed", link.fixed_joint_name, parent.at(link.pose), child)
             return
         if link.dynamics:
             self._description.remarks.append(
@@ -254,10 +257,9 @@ class UsdWriter:
         identifier = self._names.take(link.name)  # unique in the stage, as tools search prims by name alone
         path = parent.path.AppendChild(identifier)
         xform = self._api.UsdGeom.Xform.Define(self._stage, path)
-        pose = parent.pose @ link.pose
-        xform.AddTransformOp().Set(to_gf_matrix(pose))
+        self._carriers[link.name] = parent.at(link.pose)
+        xform.AddTransformOp().Set(to_gf_matrix(self._carriers[link.name].pose))
         set_text(xform.GetPrim(), NAME, link.name)
-        self._carriers[link.name] = _Carrier(parent.path, pose)
 
     def _body_prim(self, name: str, pose: Matrix) -> Any:
         path = self._root.GetPath().AppendChild(self._names.take(name))
@@ -271,39 +273,21 @@ class UsdWriter:
         """Return the motion of a joint from 0 to home, in coordinates of its link."""
         if isinstance(joint, BallJointDescription):
             turn = quaternion(np.array([self._home[f"{joint.name}/q{c}"] for c in "xyzw"]))
-            around = translation(np.array(joint.point))
-            return np.asarray(around @ transform(turn, np.zeros(3)) @ np.linalg.inv(around))
-        amount = float(np.polynomial.polynomial.polyval(self._home[joint.symbol.path], joint.coefficients))
-        if not joint.is_rotation:
-            return np.asarray(translation(amount * np.array(joint.axis)))
-        around = translation(np.array(joint.point))
-        turn = axis_angle(np.array(joint.axis), np.array(amount))
-        return np.asarray(around @ transform(turn, np.zeros(3)) @ np.linalg.inv(around))
-
-    def _free_motion(self, link: LinkDescription) -> str | None:
-        """Return the name of the free motion of a link in the world; None for any other motion."""
-        if self._carriers[link.parent].path != self._root.GetPath() or len(link.joints) != 4:
-            return None
-        *slides, ball = link.joints
-        if not isinstance(ball, BallJointDescription) or any(ball.point) or ball.dynamics:
-            return None
-        for joint, axis, c in zip(slides, np.eye(3).tolist(), "xyz", strict=True):
-            if not isinstance(joint, JointDescription) or joint.is_rotation or list(joint.axis) != axis:
-                return None
-            if joint.name != f"{ball.name}/{c}" or joint.bounds != JointBounds() or joint.dynamics:
-                return None
-            if joint.symbol in self._led:
-                return None
-        return ball.name
+        else:
+            amount = np.polynomial.polynomial.polyval(self._home[joint.symbol.path], joint.coefficients)
+            if not joint.is_rotation:
+                return np.asarray(translation(amount * np.array(joint.axis)))
+            turn = axis_angle(np.array(joint.axis), np.asarray(amount))
+        point = np.array(joint.point)
+        return np.asarray(transform(turn, point - turn @ point))
 
     # -- joints ----------------------------------------------------------------------------------------------
 
     def _joints(self, link: LinkDescription, parent: _Carrier) -> None:
         """Add the joints of a link, and bodies in between if one joint does not have its motion."""
-        together = len(link.joints) > 1 and self._generic_axes(link.joints) is not None
-        groups = [link.joints] if together else [[joint] for joint in link.joints]
-        carrier, pose = parent, link.pose
-        world = self.home_poses[link.parent] @ link.pose
+        generic = self._generic_axes(link.joints)
+        groups = [[joint] for joint in link.joints] if generic is None else [link.joints]
+        carrier, world = parent.at(link.pose), self.home_poses[link.parent] @ link.pose
         for k, joints in enumerate(groups):
             for joint in joints:
                 world = world @ self._motion(joint)
@@ -314,11 +298,11 @@ class UsdWriter:
                 prim = self._body_prim(name, world)
                 self._bodies.write(prim, NO_BODY, name, moves=True)
                 child = _Carrier(prim.GetPath(), np.eye(4))
-            if len(joints) == 1:
-                self._single(joints[0], carrier, child, pose)
+            if generic is not None:
+                self._generic(joints, *generic, carrier, child)
             else:
-                self._generic(joints, carrier, child, pose)
-            carrier, pose = child, np.eye(4)
+                self._single(joints[0], carrier, child)
+            carrier = child
 
     def _generic_axes(self, joints: Sequence[_Joint]) -> tuple[Matrix, dict[str, _Joint]] | None:
         """Return the rotation of a generic joint's frame, and its degrees of freedom with their joints.
@@ -327,12 +311,9 @@ class UsdWriter:
         """
         slides = [j for j in joints if isinstance(j, JointDescription) and not j.is_rotation]
         turns = list(joints[len(slides) :])
-        if (
-            not slides
-            or [*slides, *turns] != list(joints)
-            or len(turns) > 1
-            or any(map(self._is_alone, joints))
-        ):
+        if not slides or len(joints) == 1 or len(turns) > 1 or list(joints[: len(slides)]) != slides:
+            return None
+        if any(map(self._is_alone, joints)):
             return None
         axes = [np.array(joint.axis) for joint in slides]
         turn = turns[0] if turns else None
@@ -363,36 +344,30 @@ class UsdWriter:
         """Return True if a joint has to have one degree of freedom: Newton's schemas are about all."""
         if isinstance(joint, BallJointDescription):
             return False
-        is_coupled = not joint.is_independent or joint.symbol in self._led
+        is_coupled = not joint.is_independent or joint.symbol.path in self._led
         return (
             is_coupled
             or joint.bounds.max_velocity < math.inf
             or any(joint.dynamics.get(key) for key in _PASSIVE)
         )
 
-    def _single(self, joint: _Joint, parent: _Carrier, child: _Carrier, pose: Matrix) -> None:
+    def _single(self, joint: _Joint, parent: _Carrier, child: _Carrier) -> None:
         if isinstance(joint, BallJointDescription):
-            made = self._joint(
-                "Spherical", joint.name, parent, child, pose, translation(np.array(joint.point))
-            )
+            point = translation(np.array(joint.point))
+            self._joint("Spherical", joint.name, parent.at(point), child.at(point))
             self._forget(joint.name, joint.dynamics)
             return
         frame, axis = _axis_frame(joint)
         kind = "Revolute" if joint.is_rotation else "Prismatic"
-        made = self._joint(kind, joint.name, parent, child, pose, frame)
+        made = self._joint(kind, joint.name, parent.at(frame), child.at(frame))
+        self._joint_paths[joint.name] = made.GetPath()
         made.CreateAxisAttr(axis)
         lower, upper = self._range(joint)
         if lower >= -LARGEST_FLOAT:
             made.CreateLowerLimitAttr(lower)
         if upper <= LARGEST_FLOAT:
             made.CreateUpperLimitAttr(upper)
-        self._drive(
-            made.GetPrim(),
-            "angular" if joint.is_rotation else "linear",
-            joint.name,
-            joint.dynamics,
-            joint.is_rotation,
-        )
+        self._drive(made.GetPrim(), "angular" if joint.is_rotation else "linear", joint)
         passive = {key: float(joint.dynamics[key]) for key in _PASSIVE if joint.dynamics.get(key)}
         speed = joint.bounds.max_velocity * (math.degrees(1.0) if joint.is_rotation else 1.0)
         if speed <= LARGEST_FLOAT:
@@ -400,42 +375,40 @@ class UsdWriter:
         if passive:
             self._newton(made.GetPrim(), "NewtonJointAPI", **passive)
 
-    def _generic(self, joints: Sequence[_Joint], parent: _Carrier, child: _Carrier, pose: Matrix) -> None:
-        found = self._generic_axes(joints)
-        assert found is not None
-        rotation, freedoms = found
+    def _generic(
+        self,
+        joints: Sequence[_Joint],
+        rotation: Matrix,
+        freedoms: Mapping[str, _Joint],
+        parent: _Carrier,
+        child: _Carrier,
+    ) -> None:
         last = joints[-1]
         turns = isinstance(last, BallJointDescription) or last.is_rotation
         point = np.array(last.point) if turns else np.zeros(3)
-        made = self._joint("", _common_name(joints), parent, child, pose, transform(rotation, point))
-        prim = made.GetPrim()
+        frame = transform(rotation, point)
+        prim = self._joint("", _common_name(joints), parent.at(frame), child.at(frame)).GetPrim()
         for freedom in (*TRANSLATIONS, *ROTATIONS):
             joint = freedoms.get(freedom)
+            if joint is not None:
+                set_text(prim, COORDINATE.format(freedom), joint.name)
             if isinstance(joint, JointDescription):
-                set_text(prim, COORDINATE.format(freedom), joint.name)
                 self._limit(prim, freedom, *self._range(joint))
-                self._drive(prim, freedom, joint.name, joint.dynamics, joint.is_rotation)
+                self._drive(prim, freedom, joint)
             elif joint is not None:
-                set_text(prim, COORDINATE.format(freedom), joint.name)
                 self._forget(joint.name, joint.dynamics)
             elif not (freedom in ROTATIONS and isinstance(last, BallJointDescription)):
                 self._limit(prim, freedom, 1.0, -1.0)  # low above high: locked
 
-    def _joint(
-        self, kind: str, name: str, parent: _Carrier, child: _Carrier, pose: Matrix, frame: Matrix
-    ) -> Any:
-        """Define a joint whose frame has a pose in its child; ``pose`` is that of the child at 0."""
+    def _joint(self, kind: str, name: str, *ends: _Carrier) -> Any:
+        """Define a joint between two prims; the poses are those of its frame."""
         path = self._root.GetPath().AppendPath(f"joints/{self._joint_names.take(name)}")
         made = getattr(self._api.UsdPhysics, f"{kind}Joint").Define(self._stage, path)
-        made.CreateBody0Rel().SetTargets([parent.path])
-        made.CreateBody1Rel().SetTargets([child.path])
-        in_parent, in_child = parent.pose @ pose @ frame, child.pose @ frame
-        made.CreateLocalPos0Attr(tuple(in_parent[:3, 3].tolist()))
-        made.CreateLocalRot0Attr(to_gf_quaternion(in_parent))
-        made.CreateLocalPos1Attr(tuple(in_child[:3, 3].tolist()))
-        made.CreateLocalRot1Attr(to_gf_quaternion(in_child))
         set_text(made.GetPrim(), NAME, name)
-        self._joint_paths[name] = path
+        for number, end in enumerate(ends):
+            getattr(made, f"CreateBody{number}Rel")().SetTargets([end.path])
+            getattr(made, f"CreateLocalPos{number}Attr")(tuple(end.pose[:3, 3].tolist()))
+            getattr(made, f"CreateLocalRot{number}Attr")(to_gf_quaternion(end.pose))
         return made
 
     def _range(self, joint: JointDescription) -> tuple[float, float]:
@@ -454,12 +427,13 @@ class UsdWriter:
         limit.CreateLowAttr(lower if lower >= -LARGEST_FLOAT else -math.inf)
         limit.CreateHighAttr(upper if upper <= LARGEST_FLOAT else math.inf)
 
-    def _drive(self, prim: Any, freedom: str, name: str, known: Mapping[str, Any], is_rotation: bool) -> None:
+    def _drive(self, prim: Any, freedom: str, joint: JointDescription) -> None:
         """Add what pulls at a degree of freedom as a drive towards the rest of its spring."""
+        known = joint.dynamics
         numbers = {
             key: float(x) for key, x in known.items() if isinstance(x, (int, float)) and math.isfinite(x)
         }
-        unit = math.degrees(1.0) if is_rotation else 1.0
+        unit = math.degrees(1.0) if joint.is_rotation else 1.0
         stiffness = numbers.get("spring_stiffness") or numbers.get("stiffness") or 0.0
         rest = numbers.get("spring_reference") or numbers.get("rest") or 0.0
         effort, damping = numbers.get("effort", 0.0), numbers.get("damping", 0.0)
@@ -470,7 +444,7 @@ class UsdWriter:
             drive.CreateTargetPositionAttr(rest * unit)
             if 0 < effort < LARGEST_FLOAT:
                 drive.CreateMaxForceAttr(effort)
-        self._forget(name, {key: x for key, x in known.items() if key not in _KNOWN})
+        self._forget(joint.name, {key: x for key, x in known.items() if key not in _KNOWN})
 
     def _forget(self, name: str, known: Mapping[str, Any]) -> None:
         for key, value in known.items():
@@ -512,22 +486,12 @@ class UsdWriter:
     def _loop(self, loop: LoopJoint) -> None:
         kind = "Spherical" if loop.kind == "connect" else "Fixed"
         for k, (frame, to) in enumerate(loop.ends):
-            ends = self._carriers[to], self._carriers[frame]
             name = f"{loop.name}/{k}" if k else loop.name
-            path = self._root.GetPath().AppendPath(f"joints/{self._joint_names.take(name)}")
-            made = getattr(self._api.UsdPhysics, f"{kind}Joint").Define(self._stage, path)
+            made = self._joint(kind, name, self._carriers[to], self._carriers[frame])
             made.CreateExcludeFromArticulationAttr(True)
-            set_text(made.GetPrim(), NAME, name)
-            set_text(made.GetPrim(), LOOP, loop.name)
-            dependent = made.GetPrim().CreateAttribute(
-                DEPENDENT, self._api.Sdf.ValueTypeNames.StringArray, True
-            )
-            dependent.Set(list(loop.dependent))
-            made.CreateBody0Rel().SetTargets([ends[0].path])
-            made.CreateBody1Rel().SetTargets([ends[1].path])
-            for number, end in enumerate(ends):
-                getattr(made, f"CreateLocalPos{number}Attr")(tuple(end.pose[:3, 3].tolist()))
-                getattr(made, f"CreateLocalRot{number}Attr")(to_gf_quaternion(end.pose))
+            prim, types = made.GetPrim(), self._api.Sdf.ValueTypeNames
+            set_text(prim, LOOP, loop.name)
+            prim.CreateAttribute(DEPENDENT, types.StringArray, True).Set(list(loop.dependent))
 
 
 def _axis_frame(joint: JointDescription) -> tuple[Matrix, str]:

@@ -10,7 +10,14 @@ from kineverse.model.model_view import ModelView
 from kineverse.symbols import Symbol
 
 from .body_checks import check_bodies
-from .joint_checks import check_joint_axis, check_joint_limits, check_moved_bodies, check_plane, check_scale
+from .joint_checks import (
+    check_crossed_limits,
+    check_joint_axis,
+    check_joint_limits,
+    check_moved_bodies,
+    check_plane,
+    check_scale,
+)
 from .moving_parts import MovingPart, MovingParts
 from .report import CoordinateReport, MotionFinding, MotionReport
 from .rigid_groups import RigidGroup
@@ -67,12 +74,16 @@ def _crossed(fault: CrossedLimits) -> MotionFinding:
 
 def _check_coordinate(parts: MovingParts, coordinate: Symbol, seen: set[int]) -> Iterator[MotionFinding]:
     groups = list(parts.groups.moved_by(coordinate))
-    if coordinate in parts.model.rates or not groups:
-        why = "it is moved by speeds" if groups else "it moves no frame"
-        yield MotionFinding("no_sweep", "cannot_say", why)
+    if not groups:
+        yield MotionFinding("no_sweep", "cannot_say", "it moves no frame")
     for group in groups:
-        if coordinate not in parts.model.rates:
-            yield from _check_part(MovingPart(parts, group, coordinate))
+        part = MovingPart(parts, group, coordinate)
+        if group is groups[0]:
+            yield from check_crossed_limits(part)
+        if any(one in parts.model.rates for one in group.coordinates):
+            yield MotionFinding("no_sweep", "cannot_say", "speeds move its part", part.bodies, group.joint)
+        else:
+            yield from _check_part(part)
         if group.number not in seen:
             seen.add(group.number)
             yield from _check_bodies(parts, group)
@@ -86,7 +97,8 @@ def _check_part(part: MovingPart) -> Iterator[MotionFinding]:
         return
     axis = list(check_joint_axis(part))
     yield from axis
-    if not any(entry.severity == "finding" for entry in (*limits, *axis)):
+    is_wrong = any(entry.severity == "finding" for entry in (*limits, *axis))
+    if not is_wrong and part.limits[0] <= part.limits[1]:
         swept = list(check_sweep(part))
         yield from swept
         if not any(entry.severity == "suspect" for entry in swept):

@@ -20,8 +20,6 @@ MOST_TURNS = 2.25
 Wrists of robots have up to two turns. As radians, the least range in degrees that is found is 14.
 """
 
-LARGEST_ANGLE = 720.0  # largest range of a hinge in degrees, as from -360° to 360°; above, there is no limit
-
 SYMMETRIC = 40.0
 """Range from -x to x of a hinge up to which x may stand for no limit, as 10 rad do [rad]."""
 
@@ -65,18 +63,20 @@ SMALLEST_PART, LARGEST_PART = 1e-3, 20.0
 """Least and largest size of a part that moves [m]: that of a grain, and of a house."""
 
 
-def check_joint_limits(part: MovingPart) -> Iterator[MotionFinding]:
-    """Yield what is wrong about the limits of a coordinate."""
-    lower, upper = part.limits
-    extent = upper - lower
+def check_crossed_limits(part: MovingPart) -> Iterator[MotionFinding]:
+    """Yield a finding for a coordinate whose limits exclude each other."""
+    lower, upper = part.parts.model.limits(part.coordinate)
     if lower > upper:
         shown = format_number(lower), format_number(upper)
         text = f"no value is within the limits: the lower one is {shown[0]}, the upper one {shown[1]}"
-        yield _finding(
-            part, "crossed_limits", text, value=-extent, limit=0.0, unit="rad" if part.turns else "m"
-        )
-        return
-    if not math.isfinite(extent) or extent == 0.0 or part.axis is None:
+        unit = "rad" if part.turns else "m"
+        yield _finding(part, "crossed_limits", text, value=lower - upper, limit=0.0, unit=unit)
+
+
+def check_joint_limits(part: MovingPart) -> Iterator[MotionFinding]:
+    """Yield a finding or a suspect for limits in a wrong unit."""
+    extent = part.limits[1] - part.limits[0]
+    if not math.isfinite(extent) or extent <= 0.0 or part.axis is None:
         return
     if part.axis.turn:
         yield from _check_angles(part, part.axis, extent)
@@ -90,7 +90,7 @@ def _check_angles(part: MovingPart, axis: Axis, extent: float) -> Iterator[Motio
     turns = angle / math.tau
     # Whole degrees are no whole turns, though 44 rad nearly are.
     is_whole = abs(angle - math.tau * round(turns)) < WHOLE_TURNS and not extent.is_integer()
-    if turns > MOST_TURNS and angle <= LARGEST_ANGLE and not is_whole and not drives_slider:
+    if turns > MOST_TURNS and not is_whole and not drives_slider:
         shown = format_number(turns, 3), format_number(extent)
         text = f"turns {shown[0]} times; as degrees, a range of {shown[1]} is usual"
         is_open = sum(part.limits) == 0.0 and angle <= SYMMETRIC
@@ -174,7 +174,7 @@ def check_moved_bodies(part: MovingPart) -> Iterator[MotionFinding]:
         yield _finding(part, "moves_nothing", f"moves {what}: no shape hangs on it", severity)
     elif part.parts.has_missing_shapes(part.group.bodies):
         names = list_some((repr(b) for b, _ in part.parts.unusable if b in part.group.bodies), 3)
-        yield _finding(part, "missing_shapes", f"shapes of {names} are missing", "cannot_say")
+        yield _finding(part, "missing_shapes", f"shapes of {names} are missing or empty", "cannot_say")
     elif not part.solids:
         yield _finding(part, "no_shapes", "it has no shapes of its own", "cannot_say")
 

@@ -24,6 +24,9 @@ from .rigid_groups import SAME_AXIS, Axis, RigidGroup, RigidGroups
 
 STATES = 25  # states in which a coordinate is looked at: steps of 4° for a door, of 2 cm for a drawer
 
+LARGEST_ANGLE, LARGEST_TRAVEL = 720.0, 2e4
+"""Limits beyond which numbers stand for no limit: two turns in degrees, a house in millimetres [rad], [m]."""
+
 ROBOT_CHAIN = 3
 """Least number of moving parts in a row that are links of a robot; furniture has a door and its handle.
 
@@ -106,7 +109,7 @@ class MovingParts:
 
     def has_missing_shapes(self, bodies: Sequence[str]) -> bool:
         """Return True if any shape of some bodies cannot be used."""
-        return any(body in set(bodies) for body, _ in self.unusable)
+        return not {body for body, _ in self.unusable}.isdisjoint(bodies)
 
     @cached_property
     def _depths(self) -> list[int]:
@@ -167,8 +170,10 @@ class MovingPart:
 
     @cached_property
     def limits(self) -> tuple[float, float]:
-        """Limits of the coordinate, ±inf for none [rad], [m]."""
-        return self.parts.model.limits(self.coordinate)
+        """Limits of the coordinate, ±inf for none and for numbers that stand for none [rad], [m]."""
+        lower, upper = self.parts.model.limits(self.coordinate)
+        most = (LARGEST_ANGLE if self.turns else LARGEST_TRAVEL) / (self.axis.rate if self.axis else 1.0)
+        return lower if lower >= -most else -math.inf, upper if upper <= most else math.inf
 
     @property
     def home(self) -> float:
@@ -178,7 +183,7 @@ class MovingPart:
     @cached_property
     def axis(self) -> Axis | None:
         """Axis in the frame of the carrier, at the default state or at a limit; None if it moves at none."""
-        values = filter(math.isfinite, (self.home, *self.limits))
+        values = filter(math.isfinite, (self.home, *self.parts.model.limits(self.coordinate)))
         return next(filter(None, map(self._axis_at, values)), None)
 
     @cached_property

@@ -84,9 +84,6 @@ class Sweep:
         parts = part.parts
         self.others = parts.others(part.group)
         self.reach = max(AWAY * part.size, SMALL_GAP)
-        self._rests: dict[tuple[str, str], float] = {}
-        if not self.others:
-            return
         exceptions = [rule for rule in parts.scene.rules if not rule.check]
         rules = [_EVERYTHING, *exceptions]
         moving = part.group.coordinates  # what is carried does not move in the part
@@ -236,14 +233,16 @@ def check_sweep(part: MovingPart) -> Iterator[MotionFinding]:
     elif (swallowed := sweep.find_swallowing_body()) is not None:
         yield _swallowed(part, sweep, *swallowed)
     elif loose is not None:
-        text = f"leaves everything that it is near at rest, by more than {format_length(sweep.reach)}"
-        yield _entry(part, "comes_apart", "suspect", text, limit=sweep.reach, unit="m", state=loose)
+        kind, text = (
+            "comes_apart",
+            f"leaves all that it is near at rest, by more than {format_length(sweep.reach)}",
+        )
+        if part.is_unlimited(loose):
+            kind, text = "no_limits", f"{text}, as no limit stops it"
+        yield _entry(part, kind, "suspect", text, limit=sweep.reach, unit="m", state=loose)
 
 
 def _floating(part: MovingPart, sweep: Sweep) -> Iterator[MotionFinding]:
-    if not sweep.others:
-        yield _entry(part, "no_shapes", "cannot_say", "no other body has shapes")
-        return
     severity: Severity = "suspect" if part.is_robot_link else "finding"
     parts = part.parts
     parts.scene.update(parts.default)
