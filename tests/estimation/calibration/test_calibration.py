@@ -449,7 +449,7 @@ BAD: list[tuple[dict[str, Any], type[Exception], str]] = [
     ({"noise": 0.1}, kv.errors.InvalidValueError, "a pair of standard deviations"),
     ({"noise": (0, 1)}, kv.errors.InvalidValueError, "noise of 'position' is a positive"),
     ({"noise": {"pos": 1}}, kv.errors.UnknownNameError, "Available: orientation, position"),
-    ({"held_out": 1}, kv.errors.InvalidValueError, "held_out= is an integer of at least 2"),
+    ({"held_out": 1}, kv.errors.InvalidValueError, "held_out is 0, or at least 2"),
     ({"outliers": 0.1}, kv.errors.InvalidValueError, "Outliers are True"),
     ({"outliers": Outliers(gate=3.0)}, kv.errors.InvalidValueError, "Only a tracker has a gate"),
 ]

@@ -290,7 +290,9 @@ def calibrate(
     if not isinstance(model, Model):
         raise InvalidValueError(f"A model is calibrated, as from kv.load(...), not {model!r:.60}.")
     kinds = as_outliers(outliers)
-    folds = 0 if not held_out else as_count("held_out", held_out, 2)
+    folds = as_count("held_out", held_out, 0)
+    if folds == 1:
+        raise InvalidValueError("held_out is 0, or at least 2: of one part, no looks are left to fit.")
     if isinstance(recordings, Mapping | str) or not isinstance(recordings, Iterable):
         raise InvalidValueError(
             f"Recordings are a list of looks (state, observations), not {recordings!r:.60}."

@@ -373,11 +373,12 @@ def _matching(model: Model, word: str, pattern: str) -> list[Correction]:
             if tag and any(_KINDS[kind].suits(_inner(model.history.operation(tag))) for kind in kinds)
         ]
         names = sorted(matching)
-        which = f"'{names[0]}' has" if len(names) == 1 else f"None of {len(names)} joints and frames has"
-        noun = {"axis": "axis", "wheels": "wheels"}.get(kinds[0], kinds[0])
+        which = (
+            f"'{names[0]}'" if len(names) == 1 else f"What '{pattern}' names ({len(names)} joints or frames)"
+        )
         raise InvalidValueError(
-            f"{which} no {noun} that can be calibrated; it is for {_KINDS[kinds[0]].wanted}. "
-            + suggest(pattern, suited, "such name")
+            f"{which} has no {kinds[0]} that can be calibrated; it is for {_KINDS[kinds[0]].wanted}. "
+            + (suggest(pattern, suited, "such name") if suited else "This model has none.")
         )
     return list(result.values())
 

@@ -468,8 +468,9 @@ def check_explained(problem: CalibrationProblem, fit: CalibrationFit, sizes: str
     share = turns / max(numbers, 1.0)
     if over_errors < penalty(fit.rank) or (turns and over_turns < share * penalty(fit.rank)):
         raise InvalidValueError(
-            f"The recordings do not fit the model: with its best parameters it is off by {sizes}, which is "
-            f"no better than gross errors only. {_CONFUSED} With few looks, noise= or more of them help."
+            "The recordings do not fit the model: the best parameters explain them no better than gross "
+            f"errors do{f', with noise of {sizes}' if sizes else ''}. {_CONFUSED} With few looks, noise= or "
+            "more of them help."
         )
     if over_constant + _CERTAIN < penalty(fit.rank) - penalty(constants):
         raise InvalidValueError(
