@@ -52,11 +52,11 @@ print(found)
 with tempfile.TemporaryDirectory() as folder:
     saved = found.save(Path(folder, "pr2.urdf"))
     print(*saved.remarks, sep="\n")
-    before, after = (path.read_text().splitlines() for path in (model.sources[0].path, saved.path))
+    before, after = (path.read_text("utf-8").splitlines() for path in (model.sources[0].path, saved.path))
     print(len(set(after) - set(before)), "lines of the URDF are new")
 
 if len(sys.argv) > 1:
-    with open(sys.argv[1], "w", newline="") as file:
+    with open(sys.argv[1], "w", newline="", encoding="utf-8") as file:
         table = csv.writer(file, lineterminator="\n")
         table.writerow([*(name.removeprefix("pr2/") for name in JOINTS), *"xyz", "qx", "qy", "qz", "qw"])
         for state, poses in looks:

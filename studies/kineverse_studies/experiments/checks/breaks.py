@@ -251,7 +251,7 @@ def _inside_out(broken: SoundJoint, rng: np.random.Generator, folder: Path) -> M
         path = folder / f"{rng.integers(2**62)}.obj"
         lines = [f"v {x!r} {y!r} {z!r}" for x, y, z in faces.vertices.tolist()]
         lines += [f"f {c + 1} {b + 1} {a + 1}" for a, b, c in faces.faces.tolist()]
-        path.write_text("\n".join(lines))
+        path.write_text("\n".join(lines), encoding="utf-8")
         shapes[k] = replace_fields(shapes[k], geometry=Mesh(str(path)))
         return replace_fields(body, collisions=tuple(shapes))
 
