@@ -227,9 +227,7 @@ def ros_python(monkeypatch: pytest.MonkeyPatch) -> str:
 @pytest.fixture
 def no_compiler(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """Hide every C compiler, that of an installed package too."""
-    from kineverse.compilation.build_queue import (
-        _worker,
-    )  # this file imports nothing of the package before tests do
+    from kineverse.compilation.build_queue import _worker
 
     for build in [*_worker._wanted.values()]:  # those of earlier tests would lack the assembler
         build.wait(60.0)
