@@ -52,7 +52,7 @@ def test_a_suspect_has_status_0_and_says_where_it_is_worst(run, lid):
     assert status == 0
     assert "enters 'box'" in out
     assert "the other way it is free" in out
-    assert "at lid = 0.8125; 0.288 m, where 0.004 m is accepted" in out
+    assert "at lid = 0.8125: 0.288 m, where 0.004 m is accepted" in out
 
 
 def test_an_inertia_is_said_once_with_its_coordinate(run, lid):

@@ -196,14 +196,15 @@ def _format_entry(name: str, entry: MotionFinding) -> str:
     """Return the reason on one line, and below it the numbers and what to do."""
     where = f" ({entry.joint})" if entry.joint and entry.joint != name else ""
     first = f"    {name}{where}: {entry.text}" if name else f"    {entry.text}"
-    numbers = [f"at {key} = {format_number(value)}" for key, value in entry.state.items()]
-    if entry.severity == "cannot_say" or not (entry.advice or numbers):
+    state = ", ".join(f"{key} = {format_number(value)}" for key, value in entry.state.items())
+    if entry.severity == "cannot_say" or not (entry.advice or state):
         return first
+    numbers = [f"at {state}"] if state else []
     if entry.value is not None and entry.limit is not None:
         unit = "" if entry.unit == "1" else f" {entry.unit}"
         value, limit = (f"{format_number(number, 3)}{unit}" for number in (entry.value, entry.limit))
         numbers.append(f"{value}, where {limit} is accepted")
-    return f"{first}\n      {'; '.join(filter(None, [*numbers, entry.advice]))}"
+    return f"{first}\n      {'. '.join(filter(None, [': '.join(numbers), entry.advice]))}"
 
 
 def motions_to_json(results: list[ValidationResult], motions: list[CheckedMotion | None]) -> dict[str, Any]:
