@@ -41,6 +41,7 @@ if TYPE_CHECKING:
 
 PATIENCE = 10.0  # time that an edit waits for a server that went away, before it is given up [s]
 _ASK_TIMEOUT = 5.0
+_FIRST_LIMIT = 2.0  # time after which what was missed is asked for again, for twice as long each time [s]
 _PAUSE = 0.005
 _ROUTING = 0.5
 _LOOKING = 2.0  # longest time to find out whether a server that does not answer is there [s]
@@ -280,7 +281,17 @@ class Connection:
 
     def ask_missed(self, view: str) -> protocol.Missed | None:
         """Ask for the commits after the present revision; None if the server does not know this state."""
-        answer = self._ask(protocol.Since(self.client, self.who, view, *self.position), LONGEST)
+        question, limit = protocol.Since(self.client, self.who, view, *self.position), _FIRST_LIMIT
+        while True:
+            begin = time.monotonic()
+            try:
+                answer = self._ask(question, limit)
+                break
+            except OfflineError:
+                # A question is lost with a connection that is cut; a long answer takes long on a slow one.
+                if time.monotonic() - begin < limit or limit >= LONGEST:
+                    raise
+                limit = min(2 * limit, LONGEST)
         if isinstance(answer, protocol.Missed):
             return answer
         if isinstance(answer, protocol.Refused) and answer.reason == "stale":
