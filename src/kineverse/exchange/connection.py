@@ -41,7 +41,6 @@ if TYPE_CHECKING:
 
 PATIENCE = 10.0  # time that an edit waits for a server that went away, before it is given up [s]
 _ASK_TIMEOUT = 5.0
-_FIRST_LIMIT = 2.0  # time after which what was missed is asked for again, for twice as long each time [s]
 _PAUSE = 0.005
 _ROUTING = 0.5
 _LOOKING = 2.0  # longest time to find out whether a server that does not answer is there [s]
@@ -281,7 +280,7 @@ class Connection:
 
     def ask_missed(self, view: str) -> protocol.Missed | None:
         """Ask for the commits after the present revision; None if the server does not know this state."""
-        question, limit = protocol.Since(self.client, self.who, view, *self.position), _FIRST_LIMIT
+        question, limit = protocol.Since(self.client, self.who, view, *self.position), _ASK_TIMEOUT
         while True:
             begin = time.monotonic()
             try:
