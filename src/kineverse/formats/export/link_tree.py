@@ -258,14 +258,14 @@ class LinkTreeBuilder:
         elif max(error.position, error.angle) > self._tolerance:
             self.unsupported.refuse(worst, f"would be off by up to {error}, and no less was found")
 
-    def home_positions(self) -> dict[Symbol, float]:
-        """Return the home position of every coordinate, including those that depend on loops."""
+    def home_positions(self) -> dict[str, float]:
+        """Return the home position of every coordinate by its path, including those that depend on loops."""
         state = self.model.default_state()
         values = {s: state[s] for s in self._coordinates if s in state}
         for s in self._coordinates:
             if s not in values:
                 values[s] = float(self.model.rates.dependent[s](state))
-        return values
+        return {s.path: value for s, value in values.items()}
 
     def resolve(self, expression: Expression) -> Expression:
         """Return an expression in terms of independent coordinates, with the values of parameters."""

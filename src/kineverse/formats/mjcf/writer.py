@@ -70,7 +70,7 @@ def to_mjcf(
     description = builder.build()
     if not visuals:
         _drop_visuals(description)
-    home = {s.path: v for s, v in builder.home_positions().items()}
+    home = builder.home_positions()
     unsupported, remarks = builder.unsupported, description.remarks
     excluded: dict[str, str] = {}
     while True:

@@ -82,7 +82,7 @@ def to_sdf(
     """Convert a model to SDF."""
     builder = LinkTreeBuilder(model, SDF_CAPABILITIES, leave_out, tolerance, strict)
     description = builder.build()
-    home = {s.path: value for s, value in builder.home_positions().items()}
+    home = builder.home_positions()
     looped = set(_check_closed(model, description.loops, home, builder.unsupported))
     content = SdfWriter(description, path, builder.unsupported, home, looped).document()
     check_readable(content, path)

@@ -206,9 +206,8 @@ def to_urdf(
     return WrittenFile(content, tuple(description.remarks), description.errors, builder.unsupported.left_out)
 
 
-def _lost_homes(description: RobotDescription, home: Mapping[Symbol, float]) -> Iterator[str]:
+def _lost_homes(description: RobotDescription, values: Mapping[str, float]) -> Iterator[str]:
     """Yield the joints that a reader of URDF has elsewhere by default than at home."""
-    values = {symbol.path: value for symbol, value in home.items()}
     for link in description.links:
         for joint in link.joints:
             if isinstance(joint, BallJointDescription):

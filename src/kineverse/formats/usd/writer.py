@@ -107,7 +107,7 @@ def to_usd(
                 builder.unsupported.leave_out_motion(
                     link.name, refused.get(link.name, "is carried by nothing")
                 )
-    home = {symbol.path: value for symbol, value in builder.home_positions().items()}
+    home = builder.home_positions()
     writer = UsdWriter(description, path, builder.unsupported, home, leave_out)
     stage = writer.stage()
     _check_read_back(stage, writer.home_poses, home)
