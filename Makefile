@@ -12,7 +12,7 @@ INSTALL_FILES = printf '%s\n' $(filter %.txt,$^) | xargs -P $(JOBS) -I {} $(INST
 
 # What the demo and every command in the README need.
 DEMO := $(patsubst %,requirements/%.txt,geometry core view figures build control recording exchange)
-TEST := $(patsubst %,requirements/%.txt,peers test learning usd check)
+TEST := $(patsubst %,requirements/%.txt,peers test learning usd check notebooks)
 
 # Where there are wheels of ROS 2, and what tf2_msgs is compiled with; elsewhere tests of real nodes are skipped.
 WHEELS := $(shell $(PYTHON) -c 'import platform as p; print(p.system(), p.machine(), *p.python_version_tuple()[:2])')
