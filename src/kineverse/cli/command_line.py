@@ -140,6 +140,20 @@ def main(argv: Sequence[str] | None = None) -> int:
     -------
     0 on success; 2 if the request cannot be fulfilled, with the reason in one line on standard error; 130
     after Ctrl-C; 141 if the output pipe was closed.
+
+    Examples
+    --------
+    >>> kv.cli.main(["fk", "kitchen", "kitchen/fridge_door_handle", "--set", "kitchen/fridge_door=30deg"])
+    kitchen/fridge_door_handle in world
+         -0.866025           0        -0.5    0.829037
+              -0.5           0    0.866025    -1.41117
+                 0           1           0     1.18425
+                 0           0           0           1
+      position            0.829037    -1.41117     1.18425  m
+      roll pitch yaw        1.5708           0    -2.61799  rad
+      quaternion xyzw     0.183013   -0.683013   -0.683013    0.183013
+      at kitchen/fridge_door=0.523599
+    0
     """
     words = sys.argv[1:] if argv is None else list(argv)
     try:

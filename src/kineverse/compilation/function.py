@@ -106,6 +106,17 @@ def compile(  # noqa: A001
         If outputs depend on symbols that are not among the inputs.
     CompileError
         If there is no output, or if tier ``"c"`` is impossible.
+
+    Examples
+    --------
+    >>> model = kv.load("kitchen")
+    >>> f = kv.compile(model.fk("kitchen/fridge_door_handle")[:3, 3])
+    >>> f([0.5]).round(3)
+    array([ 0.842, -1.403,  1.184])
+    >>> f.batch([[0.0], [0.5], [1.0]]).round(3)
+    array([[ 1.137, -1.312,  1.184],
+           [ 0.842, -1.403,  1.184],
+           [ 0.626, -1.626,  1.184]])
     """
     if tier not in ("auto", "interpreter", "c"):
         raise InvalidValueError(f"Unknown tier {tier!r}; tiers are 'auto', 'interpreter' and 'c'.")
@@ -141,6 +152,18 @@ class CompiledFunction(Generic[Results]):
         The shape of every output.
     tier
         The present kind of evaluation: ``"interpreter"`` or ``"c"``.
+
+    Examples
+    --------
+    >>> x, y = kv.position("x"), kv.position("y")
+    >>> f = kv.compile([x * y, kv.array([x, y])])
+    >>> f.names, f.shapes
+    (('x', 'y'), ((), (2,)))
+    >>> product, vector = f([3, 4])
+    >>> product, vector
+    (array(12.), array([3., 4.]))
+    >>> f({"x": 3, "y": 4})[0]
+    array(12.)
     """
 
     __slots__ = (
@@ -245,6 +268,13 @@ class CompiledFunction(Generic[Results]):
         ------
         ShapeError
             If ``x`` is not an array of n columns of numbers, or ``out`` does not fit.
+
+        Examples
+        --------
+        >>> handle = kv.load("kitchen").fk("kitchen/fridge_door_handle")
+        >>> poses = kv.compile(handle).batch(np.linspace(0, 1.5, 1000).reshape(-1, 1))
+        >>> poses.shape, poses[:, 0, 3].max().round(3)
+        ((1000, 4, 4), np.float64(1.137))
         """
         if self._batch is None:
             from .batch import Batch
@@ -254,7 +284,17 @@ class CompiledFunction(Generic[Results]):
         return results
 
     def bind(self) -> Evaluator:
-        """Return an evaluator for one thread, which writes its results in place."""
+        """Return an evaluator for one thread, which writes its results in place.
+
+        Examples
+        --------
+        >>> x = kv.position("x")
+        >>> evaluate = kv.compile(x**2).bind()
+        >>> evaluate.input[0] = 3
+        >>> evaluate()
+        >>> evaluate.outputs[0]
+        array(9.)
+        """
         size, convert = self._signature.size, self._signature.vector
         with self._lock:
             if self._native is not None:
@@ -278,6 +318,12 @@ class CompiledFunction(Generic[Results]):
         ------
         CompileError
             If C is required (``tier="c"``) and has failed.
+
+        Examples
+        --------
+        >>> f = kv.compile(kv.position("x") ** 2, tier="interpreter")
+        >>> f.wait(), f.tier
+        (False, 'interpreter')
         """
         if self._library is None:
             return False

@@ -231,7 +231,14 @@ def stack_columns(columns: list[Expression | None], shape: layout.ArrayShape) ->
 
 
 def total_derivative(expression: Expression, heuristic: bool = False) -> Expression:
-    """Return ``ė = Σ D(e)[v]·v``, of the expression's shape: its rate as a function of the speeds."""
+    """Return ``ė = Σ D(e)[v]·v``, of the expression's shape: its rate as a function of the speeds.
+
+    Examples
+    --------
+    >>> x, y = kv.position("x"), kv.position("y")
+    >>> kv.expressions.total_derivative(x * y)
+    y*x:velocity + x*y:velocity
+    """
     if not expression._shape and not expression._nodes and expression._sx.is_symbolic():
         (symbol,) = expression.symbols  # the most frequent case: a limit on a joint's speed
         return symbol.derivative() if symbol.has_derivative else as_expression(0.0)

@@ -68,6 +68,15 @@ def spline(
     InvalidValueError
         For knots that do not increase, another number of values than of knots, NaN, or a periodic spline with
         different first and last values.
+
+    Examples
+    --------
+    >>> x = kv.position("x")
+    >>> profile = kv.spline(x, knots=[0, 1, 2], values=[0, 0.1, 0])
+    >>> profile({"x": 1}), profile({"x": 5})
+    (np.float64(0.1), np.float64(0.0))
+    >>> profile.gradient()[x.derivative()]({"x": 0.5})
+    np.float64(0.15000000000000002)
     """
     t, y = _numbers(knots, "knot"), _numbers(values, "value")
     _check_knots(t)

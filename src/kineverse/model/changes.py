@@ -17,7 +17,12 @@ from .operation import RATES
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """Structural change of one value; ``before`` is None for an added value, ``after`` for a removed one."""
+    """Structural change of one value; ``before`` is None for an added value, ``after`` for a removed one.
+
+    See Also
+    --------
+    kineverse.model.Diff
+    """
 
     kind: str
     name: str
@@ -65,6 +70,17 @@ class Diff:
         ``changes`` shows if their writes changed. Empty in comparisons of models.
     poses
         Frames with other forward kinematics, among those that a listener follows by ``frames=``.
+
+    Examples
+    --------
+    >>> model = kv.load("kitchen")
+    >>> before = model.snapshot()
+    >>> with model.edit() as edit:
+    ...     edit.constrain("ajar", 0, kv.position("kitchen/fridge_door"), 0.3)
+    'constraint ajar'
+    >>> diff = kv.model.compare_models(before, model)
+    >>> diff.paths, diff.added
+    (('constraints/ajar',), ('constraint ajar',))
     """
 
     version: int

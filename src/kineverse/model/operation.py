@@ -48,6 +48,10 @@ class Writes:
         Bodies by frame, and records for people and exporters.
     data
         Other immutable values that can be compared.
+
+    See Also
+    --------
+    kineverse.Operation
     """
 
     frames: Mapping[str, Frame | tuple[str, TransformLike | Sequence[TransformLike]]] = field(
@@ -163,6 +167,27 @@ class Operation(ABC):
                     frames={self.name: (self.parent, kv.translation(q, 0, 0))},
                     constraints={f"{self.name}/range": (0, q, 1)},
                 )
+
+    Examples
+    --------
+    >>> from dataclasses import dataclass
+    >>> @dataclass(frozen=True)
+    ... class Slide(kv.Operation):
+    ...     name: str
+    ...     parent: str
+    ...
+    ...     def apply(self, model):
+    ...         q = kv.position(self.name)
+    ...         return kv.model.Writes(
+    ...             frames={self.name: (self.parent, kv.translation(q, 0, 0))},
+    ...             constraints={f"{self.name}/range": (0, q, 1)},
+    ...         )
+    >>> model = kv.Model()
+    >>> with model.edit() as edit:
+    ...     edit.apply(Slide("drawer", "world"))
+    'slide drawer'
+    >>> model.fk("drawer")({"drawer": 0.3})[:3, 3]
+    array([0.3, 0. , 0. ])
     """
 
     traceable: ClassVar[bool] = True

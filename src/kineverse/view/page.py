@@ -72,6 +72,12 @@ def show(
         If viser is not installed.
     InvalidValueError
         If the model is none, the port is taken or no port, or the host is not one of this computer.
+
+    Examples
+    --------
+    >>> page = kv.show(kv.load("kitchen"), block=False, open_browser=False, port=0)
+    >>> page.move({"kitchen/fridge_door": 0.8})
+    >>> page.stop()
     """
     from .viewer import Viewer  # for start-up time
 

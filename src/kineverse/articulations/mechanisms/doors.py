@@ -83,6 +83,17 @@ class FoldingDoor(Mechanism, document_kind="FoldingDoor"):
     InvalidValueError
         For lengths that are not positive, or with which the arm does not reach at some angle; for a stiffness
         that is not positive.
+
+    Examples
+    --------
+    >>> model = kv.Model()
+    >>> with model.edit() as edit:
+    ...     edit.apply(kv.articulations.FoldingDoor(name="cupboard", parent="world"))
+    'folding door cupboard'
+    >>> model.fk("cupboard/handle")({"cupboard": 0.92})[[0, 2], 3].round(3)
+    array([-0.45 , -0.131])
+    >>> model.data["cupboard/spring"]({"cupboard": 0.0}).round(2)
+    np.float64(-2.4)
     """
 
     main: ClassVar[str] = "lower_panel"
@@ -250,6 +261,17 @@ class GarageDoor(Mechanism, document_kind="GarageDoor"):
     InvalidValueError
         For lengths that are not positive, a play that is not below the length, or a catch beyond the bolt's
         limits.
+
+    Examples
+    --------
+    >>> model = kv.Model()
+    >>> with model.edit() as edit:
+    ...     edit.apply(kv.articulations.GarageDoor(name="garage", parent="world"))
+    'garage door garage'
+    >>> model.limits("garage/door:velocity", {"garage/door": 0, "garage/bolt": 0})
+    (0.0, 0.0)
+    >>> model.limits("garage/door:velocity", {"garage/door": 0, "garage/bolt": 0.5})
+    (-1.0, 1.0)
     """
 
     main: ClassVar[str] = "door"

@@ -60,6 +60,15 @@ class ScissorLift(Mechanism, document_kind="ScissorLift"):
     ------
     InvalidValueError
         For lengths that are not positive, a wrong number of stages, or limits beyond flat and upright.
+
+    Examples
+    --------
+    >>> model = kv.Model()
+    >>> with model.edit() as edit:
+    ...     edit.apply(kv.articulations.ScissorLift(name="lift", parent="world", stages=3, arm=1.0))
+    'scissor lift lift'
+    >>> model.fk("lift/platform")({"lift": np.pi / 6})[2, 3].round(3)
+    np.float64(1.5)
     """
 
     main: ClassVar[str] = "platform"
@@ -137,6 +146,19 @@ class DeskLamp(Mechanism, document_kind="DeskLamp"):
     ------
     InvalidValueError
         For lengths that are not positive, or limits at which a parallelogram becomes flat.
+
+    Examples
+    --------
+    >>> model = kv.Model()
+    >>> with model.edit() as edit:
+    ...     edit.apply(kv.articulations.DeskLamp(name="lamp", parent="world"))
+    'desk lamp lamp'
+    >>> model.degrees_of_freedom
+    (lamp/lower, lamp/upper)
+    >>> model.fk("lamp/head")({"lamp/lower": 0.4, "lamp/upper": 0.2})[:3, :3].round(9)
+    array([[ 1.,  0.,  0.],
+           [ 0.,  1.,  0.],
+           [-0.,  0.,  1.]])
     """
 
     main: ClassVar[str] = "head"
@@ -215,6 +237,16 @@ class PistonAndRod(Mechanism, document_kind="PistonAndRod"):
     InvalidValueError
         For lengths that are not positive, or a rod that is not longer than the crank, which cannot complete
         a revolution then.
+
+    Examples
+    --------
+    >>> model = kv.Model()
+    >>> with model.edit() as edit:
+    ...     edit.apply(kv.articulations.PistonAndRod(name="engine", parent="world", crank=0.04, rod=0.12))
+    'piston and rod engine'
+    >>> height = model.fk("engine/piston")[2, 3]
+    >>> height({"engine": 0}).round(3), height({"engine": np.pi}).round(3)
+    (np.float64(0.16), np.float64(0.08))
     """
 
     main: ClassVar[str] = "piston"
@@ -291,6 +323,16 @@ class PedalBin(Mechanism, document_kind="PedalBin"):
     ------
     InvalidValueError
         For lengths that are not positive, or an arm that lifts the rod by the lid's lever or more.
+
+    Examples
+    --------
+    >>> model = kv.Model()
+    >>> with model.edit() as edit:
+    ...     edit.apply(kv.articulations.PedalBin(name="bin", parent="world"))
+    'pedal bin bin'
+    >>> lid = kv.spatial.rotation_angle(model.fk("bin/lid"))
+    >>> lid({"bin": 0.1}).round(3), lid({"bin": 0.2}).round(3)
+    (np.float64(0.394), np.float64(0.87))
     """
 
     main: ClassVar[str] = "lid"

@@ -78,6 +78,14 @@ def to_jax(
         If expressions or their gradients depend on symbols that are not among the inputs.
     CompileError
         If there is no expression, or if C is required and impossible.
+
+    Examples
+    --------
+    >>> import jax
+    >>> x, y = kv.position("x"), kv.position("y")
+    >>> f = kv.to_jax(x * np.sin(y), [x, y], tier="operations")
+    >>> jax.grad(f)(jax.numpy.array([2.0, 0.0]))
+    Array([0., 2.], dtype=float32)
     """
     jax = _import_jax()
     check_tier(tier)

@@ -68,6 +68,16 @@ def to_torch(
         If expressions or their gradients depend on symbols that are not among the inputs.
     CompileError
         If there is no expression, or if C is required and impossible.
+
+    Examples
+    --------
+    >>> import torch
+    >>> x, y = kv.position("x"), kv.position("y")
+    >>> f = kv.to_torch(x * np.sin(y), [x, y], tier="operations")
+    >>> point = torch.tensor([2.0, 0.0], requires_grad=True)
+    >>> f(point).backward()
+    >>> point.grad
+    tensor([0., 2.])
     """
     torch = _import_torch()
     check_tier(tier)

@@ -55,6 +55,17 @@ def follow(
     ------
     Exception
         Whatever the first build raises. Errors of later ones are in :attr:`Follower.error`.
+
+    Examples
+    --------
+    >>> model = kv.load("kitchen")
+    >>> build = lambda snapshot: kv.compile(snapshot.fk("kitchen/fridge_door_handle"), tier="interpreter")
+    >>> follower = kv.follow(model, build, frames=["kitchen/fridge_door_handle"])
+    >>> follower.value([0.5])[:3, 3].round(3)
+    array([ 0.842, -1.403,  1.184])
+    >>> follower.version
+    1
+    >>> follower.close()
     """
     if not isinstance(model, Model):
         raise ExpressionError(f"A kv.Model can be followed, and a {type(model).__name__} does not change.")
@@ -66,7 +77,12 @@ def follow(
 
 
 class BuiltValue(NamedTuple, Generic[T]):
-    """Value with the version of the model that it was built from."""
+    """Value with the version of the model that it was built from.
+
+    See Also
+    --------
+    kineverse.follow
+    """
 
     value: T
     version: int
@@ -81,6 +97,10 @@ class Follower(Closing, Generic[T]):
         The value and the version of the model that it was built from, together.
     error
         Exception of the last build, if it failed; the value is then that of the last one that did not.
+
+    See Also
+    --------
+    kineverse.follow
     """
 
     current: BuiltValue[T]
@@ -133,6 +153,19 @@ class Follower(Closing, Generic[T]):
         -------
         bool
             False if the time is over, the follower is closed, or the build for that version has failed.
+
+        Examples
+        --------
+        >>> model = kv.load("kitchen")
+        >>> follower = kv.follow(model, lambda snapshot: len(snapshot.frames))
+        >>> with model.edit() as edit:
+        ...     edit.add_frame("lamp", parent="world")
+        'frame lamp'
+        >>> follower.wait(timeout=60)
+        True
+        >>> follower.value
+        55
+        >>> follower.close()
         """
         wanted = self._model.version if version is None else as_count("version", version, 0)
         limit = None if timeout is None else as_tolerance(timeout, "A timeout")
