@@ -23,6 +23,7 @@ __all__ = [
     "ROLES",
     "Role",
     "Symbol",
+    "acceleration",
     "parameter",
     "parse_symbol_name",
     "position",
@@ -43,7 +44,7 @@ _INTERNING = threading.Lock()
 
 
 class Symbol(Expression):
-    """A scalar symbol, see :func:`position`, :func:`velocity`, :func:`symbol` and :func:`parameter`.
+    """A scalar symbol, see :func:`position`, :func:`velocity`, :func:`acceleration` and :func:`parameter`.
 
     Attributes
     ----------
@@ -251,6 +252,11 @@ def velocity(path: str) -> Symbol:
     True
     """
     return Symbol(path, 1)
+
+
+def acceleration(path: str) -> Symbol:
+    """Return the acceleration symbol of a degree of freedom."""
+    return Symbol(path, 2)
 
 
 def parameter(path: str, value: float) -> Symbol:

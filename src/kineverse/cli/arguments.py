@@ -11,21 +11,19 @@ import json
 import math
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from fnmatch import fnmatchcase
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import kineverse as kv
 from kineverse._extras import install_command
+from kineverse._names import is_pattern, match_names
 from kineverse.compilation.toolchain import no_compiler, toolchain
 from kineverse.errors import (
     CompileError,
     DuplicateNameError,
     InvalidValueError,
     MissingDependencyError,
-    UnknownNameError,
-    suggest,
 )
 from kineverse.expressions.printing import format_number
 from kineverse.formats.file_formats import is_mjcf
@@ -253,16 +251,9 @@ def find_turn_notes(texts: Iterable[str]) -> list[str]:
 def match_coordinates(model: ModelView, words: Iterable[str], option: str) -> list[str]:
     """Return the names of an option, with those of coordinates in place of patterns such as ``kitchen/*``."""
     names = [str(symbol) for symbol in model.degrees_of_freedom]
-    found: list[str] = []
-    for word in words:
-        matching = [word]
-        if any(sign in word for sign in "*?["):
-            matching = [name for name in names if fnmatchcase(name, word)]
-            if not matching:
-                similar = suggest(word, names, "coordinate")
-                raise UnknownNameError(f"{option} {word}: no coordinate matches. {similar}")
-        found += matching
-    return found
+    # The library knows what else a name may stand for.
+    parts = (match_names(w, names, "coordinate", option) if is_pattern(w) else (w,) for w in words)
+    return [name for part in parts for name in part]
 
 
 def print_notes(lines: Iterable[str]) -> None:

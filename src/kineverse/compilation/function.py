@@ -16,6 +16,8 @@ import casadi as ca
 import numpy as np
 import numpy.typing as npt
 
+from kineverse._names import answer_foreign_names
+from kineverse._synonyms import FUNCTION_SYNONYMS
 from kineverse.errors import CompileError, InvalidValueError
 from kineverse.expressions import Expression, ExpressionLike, array
 from kineverse.expressions.expression import NO_NODES, from_casadi
@@ -127,6 +129,8 @@ def compile(  # noqa: A001
     return CompiledFunction(expressions, inputs, single=single, tier=tier, wait=wait)
 
 
+@answer_foreign_names("A compiled function", FUNCTION_SYNONYMS)
+@answer_foreign_names("A compiled function", FUNCTION_SYNONYMS)
 class CompiledFunction(Generic[Results]):
     """A function of a vector of numbers, created by :func:`compile`.
 

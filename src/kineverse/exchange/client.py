@@ -71,12 +71,18 @@ def load_live(
         __version__,
         "",
         "",
-        as_entries("frames=", frames or (), str, "names of frames") if is_part else EVERY_FRAME,
+        _parse_frames(frames) if is_part else EVERY_FRAME,
         tuple(map(str, as_entries("symbols=", symbols or (), (Symbol, str), "symbols, or their names"))),
         bodies,
         is_part or not bodies,
     )
     return LiveModel(Connection(Address.parse(source)), wish)
+
+
+def _parse_frames(frames: Iterable[str] | None) -> tuple[str, ...]:
+    """Return frames for a wish, in which ``kitchen/`` stands for ``kitchen/*``."""
+    names = as_entries("frames=", frames or (), str, "names of frames")
+    return tuple(name[:-1] if name == "*" or name.endswith("/*") else name for name in names)
 
 
 def include_live(edit: Edit, source: str, prefix: str | None = None) -> list[str]:

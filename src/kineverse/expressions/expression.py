@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 
     from kineverse.symbols import Symbol
 
+    from .gradient import Gradient
     from .node import AccessListener, Node
 
 ExpressionLike: TypeAlias = "Expression | float | int | npt.ArrayLike | Sequence[Any]"
@@ -334,11 +335,12 @@ class Expression(ArrayMethods):
 
     # -- gradients -----------------------------------------------------------------------------------------
 
-    def gradient(self, heuristic: bool = True) -> Mapping[Symbol, Expression]:
+    def gradient(self, heuristic: bool = True) -> Gradient:
         """Return D(e): a mapping from derivative symbols to expressions of this shape.
 
         The augmented gradient of the papers (2022, Eqs. 5-8): where nothing was augmented, the entry of ``ȧ``
-        is ∂e/∂a. Entries that are structurally zero are left out.
+        is ∂e/∂a. Entries that are structurally zero are left out. The numbers of all entries,
+        by name, are ``e.gradient()({name: number})``.
 
         Parameters
         ----------

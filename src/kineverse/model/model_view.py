@@ -7,13 +7,20 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from kineverse._checks import check_flag
-from kineverse.errors import DuplicateNameError, InvalidValueError, UnknownNameError, suggest
+from kineverse._names import is_pattern, matches_pattern, no_match_error
+from kineverse.errors import (
+    DuplicateNameError,
+    ExpressionError,
+    InvalidValueError,
+    UnknownNameError,
+    suggest,
+)
 from kineverse.expressions.expression import Expression, ExpressionLike
 from kineverse.expressions.substitution import apply_substitution
 from kineverse.state import State, StateLike, as_state, check_meant
@@ -643,3 +650,37 @@ class ModelView(SymbolicView):
             for part in parts
         )
         return f"<div><p>{escape(str(self))}</p>{tables}</div>"
+
+
+def find_symbols(
+    model: ModelView, names: Symbol | str | Iterable[Symbol | str], argument: str = ""
+) -> Iterator[Symbol]:
+    """Yield the symbols of names or patterns; an articulation stands for its coordinates.
+
+    A pattern stands for the degrees of freedom that match, else for those of the articulations that match.
+    Messages begin with the argument, such as ``fixed=``.
+    """
+    coordinates = set(map(str, model.symbols))
+    for item in (names,) if isinstance(names, str | Symbol) else names:
+        if isinstance(item, Symbol):
+            yield item
+        elif not isinstance(item, str):
+            raise ExpressionError(f"{argument or 'This'} takes symbols or their names, not {item!r:.80}.")
+        elif item in model.articulations and item not in coordinates:
+            yield from model.articulations[item].coordinates
+        elif is_pattern(item) and item not in coordinates:
+            yield from _match_symbols(model, item, argument)
+        else:
+            yield model.symbol(item)
+
+
+def _match_symbols(model: ModelView, pattern: str, argument: str) -> list[Symbol]:
+    free = {str(s): s for s in model.degrees_of_freedom}
+    found = [s for name, s in free.items() if matches_pattern(name, (pattern,))]
+    joints = {name: joint.coordinates for name, joint in model.articulations.items() if joint.coordinates}
+    found = found or [
+        s for name, several in joints.items() if matches_pattern(name, (pattern,)) for s in several
+    ]
+    if not found:
+        raise no_match_error(pattern, [*free, *joints], "coordinate", argument)
+    return found

@@ -12,6 +12,8 @@ import numpy as np
 import numpy.typing as npt
 
 from kineverse._checks import finite_number
+from kineverse._names import answer_foreign_names
+from kineverse._synonyms import PATH_SYNONYMS
 from kineverse.errors import InvalidValueError
 from kineverse.lie import Array
 from kineverse.state import State
@@ -25,6 +27,7 @@ from .trajectories.kinematic_limits import RAMP
 DEVIATION = 0.1  # largest distance of a trajectory from the corners of a path in free space [rad], [m]
 
 
+@answer_foreign_names("A path", PATH_SYNONYMS)
 @dataclass(frozen=True, eq=False)
 class Path:
     """Result of :meth:`.Planner.plan`.

@@ -10,6 +10,8 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 import numpy.typing as npt
 
+from kineverse._names import answer_foreign_names
+from kineverse._synonyms import IDENTIFICATION_SYNONYMS
 from kineverse.errors import InvalidValueError, UnknownNameError, suggest
 from kineverse.estimation.linear_algebra import invert_matrices, singularity_named
 from kineverse.estimation.noise import Outliers
@@ -198,6 +200,7 @@ class LazyFit(NamedTuple):
     compute: Callable[[], Fit]
 
 
+@answer_foreign_names("An identification", IDENTIFICATION_SYNONYMS)
 @dataclass(frozen=True, eq=False)
 class IdentificationResult:
     """Fits of all families, the most probable first, each computed on first access.

@@ -10,6 +10,8 @@ from types import MappingProxyType
 import numpy as np
 import numpy.typing as npt
 
+from kineverse._names import answer_foreign_names
+from kineverse._synonyms import ESTIMATE_SYNONYMS
 from kineverse.compilation import compile
 from kineverse.estimation.linear_algebra import inverse_spd
 from kineverse.lie import Array
@@ -124,6 +126,7 @@ class TrackerState:
     residuals: Callable[[], dict[str, Residual]] = dict  # of the last update
 
 
+@answer_foreign_names("An estimate", ESTIMATE_SYNONYMS)
 class Estimate:
     """MAP estimate of the state inside the limits, with its uncertainty.
 

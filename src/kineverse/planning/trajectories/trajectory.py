@@ -23,6 +23,8 @@ import numpy as np
 import numpy.typing as npt
 
 from kineverse._checks import finite_number
+from kineverse._names import answer_foreign_names
+from kineverse._synonyms import TRAJECTORY_SYNONYMS
 from kineverse.errors import ExpressionError, FormatError, InvalidValueError, ShapeError
 from kineverse.expressions.expression import ExpressionLike
 from kineverse.formats.files import read_file, replace_file
@@ -38,6 +40,7 @@ _JUMP = 1e-6  # largest difference of positions [rad], [m] and velocities where 
 _GAIN, _WEIGHT = 5.0, 100.0  # gain [1/s] and weight of the goals of a follower
 
 
+@answer_foreign_names("A trajectory", TRAJECTORY_SYNONYMS)
 @dataclass(frozen=True, eq=False, repr=False)
 class Trajectory:
     """Motion of coordinates over time: knots with positions and velocities, and cubics between them.
