@@ -33,10 +33,11 @@ class Gradient(Mapping["Symbol", Expression]):
     Keys are symbols or their names, such as ``door:velocity``.
     """
 
-    __slots__ = ("_entries",)
+    __slots__ = ("_entries", "_of")
 
-    def __init__(self, entries: Mapping[Symbol, Expression]) -> None:
+    def __init__(self, entries: Mapping[Symbol, Expression], of: Expression | None = None) -> None:
         self._entries = dict(entries)
+        self._of = of  # the expression, if some of the entries may be trends
 
     def __getitem__(self, key: Symbol | str) -> Expression:
         entry: Expression | None = self.get(key)
@@ -77,25 +78,34 @@ class Gradient(Mapping["Symbol", Expression]):
         """Return speeds and entries."""
         return self._entries.items()
 
+    @property
+    def trends(self) -> frozenset[Symbol]:
+        """Speeds whose entries are trends: directions of search, which the exact gradient does not have."""
+        if self._of is None:
+            return frozenset()
+        exact = gradient(self._of, heuristic=False)
+        return frozenset(speed for speed, entry in self._entries.items() if entry != exact.get(speed))
+
     def __reduce__(self) -> Any:
-        return Gradient, (self._entries,)
+        return Gradient, (self._entries, self._of)
 
     def __repr__(self) -> str:
         from .printing import mapping_text
 
         return mapping_text(self)
 
-    def _repr_html_(self) -> str:
-        from .printing import mapping_html
+    def _repr_latex_(self) -> str:
+        from .printing import gradient_latex
 
-        return mapping_html(self)
+        return f"$\\displaystyle {gradient_latex(self, self.trends)}$"
 
 
 def gradient(expression: Expression, heuristic: bool = True) -> Mapping[Symbol, Expression]:
     """Return D(e), see :meth:`Expression.gradient`."""
     known = expression._gradients.get(heuristic)
     if known is None:
-        known = Gradient(_gradient(expression, heuristic))
+        may_have_trends = heuristic and bool(expression._nodes)
+        known = Gradient(_gradient(expression, heuristic), expression if may_have_trends else None)
         expression._gradients[heuristic] = known
     result: Mapping[Symbol, Expression] = known
     return result
