@@ -416,6 +416,13 @@ class CompiledFunction(Generic[Results]):
         outputs = ", ".join(map(str, self.shapes[:6])) + (", ..." if len(self.shapes) > 6 else "")
         return f"CompiledFunction({len(self.names)} inputs: {inputs} -> {outputs}; {self.tier})"
 
+    def _repr_html_(self) -> str:
+        from kineverse._rich_display import html_table  # for start-up time
+
+        rows = [("input", str(i), name) for i, name in enumerate(self.names)]
+        rows += [("output", str(i), f"shape {shape}") for i, shape in enumerate(self.shapes)]
+        return html_table(f"compiled function, evaluated by {self.tier}", ("", "number", ""), rows)
+
 
 @dataclass(frozen=True, slots=True)
 class _Code:

@@ -567,17 +567,10 @@ class Expression(ArrayMethods):
 
         return text(notify_access(self))
 
-    def _repr_latex_(self) -> str | None:
-        from .printing import latex
+    def _repr_latex_(self) -> str:
+        from .printing import expression_latex
 
-        formula = latex(notify_access(self))
-        return None if formula is None else f"$\\displaystyle {formula}$"
-
-    def _repr_html_(self) -> str | None:
-        from .printing import html
-
-        # A notebook prefers HTML to LaTeX, so there is none for expressions that are short enough for LaTeX.
-        return html(self) if self._repr_latex_() is None else None
+        return f"$\\displaystyle {expression_latex(notify_access(self))}$"
 
     # -- numpy ---------------------------------------------------------------------------------------------
 

@@ -638,18 +638,10 @@ class ModelView(SymbolicView):
         return f"<{type(self).__name__}: {self}>"
 
     def _repr_html_(self) -> str:
-        from html import escape
+        from .display import model_html  # for start-up time
 
         with self._lock:
-            mappings = [self.frames, self.articulations, self.constraints, self.bodies, self.data]
-            parts = [part._repr_html_() for part in mappings if part]  # type: ignore[attr-defined]
-            parts += [self.rates._repr_html_()] if self.rates else []
-        tables = "".join(
-            f"<details><summary>{escape(part.partition('<caption>')[2].partition('</caption>')[0])}</summary>"
-            f"{part}</details>"
-            for part in parts
-        )
-        return f"<div><p>{escape(str(self))}</p>{tables}</div>"
+            return model_html(self)
 
 
 def find_symbols(

@@ -11,13 +11,13 @@ import numpy as np
 import numpy.typing as npt
 
 from kineverse._checks import as_tolerance
+from kineverse._rich_display import html_table
 from kineverse.compilation.function import WantedTier, compile_columns, insert_values
 from kineverse.errors import UnknownNameError
 from kineverse.expressions.expression import Expression, as_expression
 from kineverse.expressions.graph import lower
 from kineverse.expressions.implicit import implicit_nodes
 from kineverse.expressions.layout import SX
-from kineverse.expressions.printing import html_table
 from kineverse.state import State, StateLike, as_state
 from kineverse.symbols import Symbol
 

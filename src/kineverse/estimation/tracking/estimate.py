@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from kineverse._names import answer_foreign_names
+from kineverse._rich_display import html_table
 from kineverse._synonyms import ESTIMATE_SYNONYMS
 from kineverse.compilation import compile
 from kineverse.estimation.linear_algebra import inverse_spd
@@ -286,6 +287,12 @@ class Estimate:
         at = "" if self.stamp is None else f" at {self.stamp:g} s"
         values = ", ".join(f"{s}={value:.4g}±{self.deviation[s]:.2g}" for s, value in self.state.items())
         return f"<Estimate{at}: {values}{', lost' if self.lost else ''}>"
+
+    def _repr_html_(self) -> str:
+        rows = [(str(s), f"{value:.4g}", f"{self.deviation[s]:.2g}") for s, value in self.state.items()]
+        at = "" if self.stamp is None else f" at {self.stamp:g} s"
+        caption = f"estimate{at}{', lost' if self.lost else ''}"
+        return html_table(caption, ("coordinate", "value", "standard deviation"), rows)
 
 
 @dataclass(frozen=True, eq=False)
