@@ -8,7 +8,7 @@ BIN := $(VENV)/bin
 INSTALL := $(BIN)/python -m pip install --quiet --no-input --disable-pip-version-check --no-deps
 
 # One file is unpacked by one core, the largest first.
-INSTALL_FILES = printf '%s\n' $(filter %.txt,$^) | xargs -P $(JOBS) -I {} $(INSTALL) -r {}
+INSTALL_FILES = printf '%s\n' $(filter %.txt,$^) | xargs -P $(JOBS) -I {} $(INSTALL) --require-hashes -r {}
 
 # What the demo and every command in the README need.
 DEMO := $(patsubst %,requirements/%.txt,geometry core view figures build control recording exchange)
@@ -18,7 +18,7 @@ TEST := $(patsubst %,requirements/%.txt,peers test learning usd check notebooks)
 WHEELS := $(shell $(PYTHON) -c 'import platform as p; print(p.system(), p.machine(), *p.python_version_tuple()[:2])')
 ROS := $(if $(and $(filter Linux-x86_64-3-11,$(subst $() ,-,$(WHEELS))),$(shell command -v cmake),$(shell command -v c++)),$(VENV)/ros.installed)
 
-.PHONY: help demo test ros sanitize fuzz faults format clean
+.PHONY: help demo test ros sanitize fuzz faults release format clean
 .NOTPARALLEL:
 
 help:
@@ -28,6 +28,7 @@ help:
 	@echo "make sanitize  all C with sanitizers, and the tests that use it (ARGS=--short: a little of each)"
 	@echo "make fuzz    look for inputs that break a reader (ARGS='--target sdf --minutes 60')"
 	@echo "make faults  damage files of model servers, cut networks, kill and freeze processes (ARGS=live: of a moving robot)"
+	@echo "make release  build the distributions, check them, and try them in clean environments (ARGS='--only core')"
 	@echo "make format  format the code and mend what the linter can mend"
 	@echo "make clean   remove the environment and what the tools left"
 
@@ -56,6 +57,9 @@ fuzz: $(VENV)/fuzz.installed
 
 faults: $(VENV)/test.installed
 	PYTHONPATH=tools $(BIN)/python -m faults $(ARGS)
+
+release: $(VENV)/release.installed
+	$(VENV)/release/bin/python tools/release $(ARGS)
 
 format: $(VENV)/test.installed
 	$(BIN)/ruff format .
@@ -86,8 +90,15 @@ $(VENV)/ros.installed: requirements/ros.txt tools/ros_environment.py $(VENV)/dem
 	@echo "Installing ROS 2 into $(VENV)/ros; this takes a minute, once."
 	@$(BIN)/python -m venv --without-pip --clear $(VENV)/ros
 	@$(BIN)/python -m pip --python $(VENV)/ros/bin/python install --quiet --no-input --disable-pip-version-check \
-	    --no-deps -r requirements/ros.txt
+	    --no-deps --require-hashes -r requirements/ros.txt
 	@$(VENV)/ros/bin/python tools/ros_environment.py $(BIN)/python
+	@touch $@
+
+# It has other versions of what .venv has.
+$(VENV)/release.installed: requirements/release.txt | $(BIN)/python
+	@$(BIN)/python -m venv --clear $(VENV)/release
+	@$(BIN)/python -m pip --python $(VENV)/release/bin/python install --quiet --no-input --disable-pip-version-check \
+	    --no-deps --require-hashes -r requirements/release.txt
 	@touch $@
 
 $(VENV)/fuzz.installed: requirements/fuzz.txt $(VENV)/test.installed
