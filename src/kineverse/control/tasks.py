@@ -334,7 +334,7 @@ def same_position(a_T: ExpressionLike, b_T: ExpressionLike) -> Expression:
 
 
 def same_orientation(a_T: ExpressionLike, b_T: ExpressionLike) -> Expression:
-    """Return the rotation vector of b in a, shape (3,) [rad]; see :func:`.log_so3`."""
+    """Return the rotation vector of b in a, shape (3,) [rad]; see :func:`kineverse.spatial.log_so3`."""
     return log_so3(as_transform(a_T)[:3, :3].T @ as_transform(b_T)[:3, :3])
 
 

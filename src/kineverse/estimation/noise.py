@@ -128,7 +128,7 @@ class Outliers:
         square
             Squared norm of its whitened residual.
         log_scale
-            ½ log |2πR|.
+            ½ log det(2πR).
         log_density
             Result of :meth:`log_density`.
 
