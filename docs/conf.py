@@ -7,6 +7,7 @@ ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT / "tools"))
 
 from kineverse import __version__  # noqa: E402
+from website.names import list_aliases  # noqa: E402
 
 project = "Kineverse"
 author = "The Kineverse developers"
@@ -32,8 +33,12 @@ autodoc_preserve_defaults = True
 autodoc_inherit_docstrings = True
 numpydoc_show_class_members = False
 numpydoc_class_members_toctree = False
+numpydoc_xref_param_type = True
+numpydoc_xref_ignore = "all"
+numpydoc_xref_aliases = list_aliases()
 
 html_theme = "furo"
+pygments_dark_style = "github-dark"
 html_title = "Kineverse"
 html_copy_source = False
 html_show_sourcelink = False

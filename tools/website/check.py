@@ -8,8 +8,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from urllib.parse import unquote
 
-from sphinx.util.inventory import InventoryFile
-
 from website.names import find_names
 
 _TAG = re.compile(r"<(?:a|link|script|img|source|iframe|video|object|use)\b[^>]*>")
@@ -24,6 +22,8 @@ def check_site(site: Path) -> list[str]:
 
 
 def _list_missing_names(site: Path) -> Iterator[str]:
+    from sphinx.util.inventory import InventoryFile  # which the tests do without
+
     inventory = InventoryFile.loads((site / "objects.inv").read_bytes(), uri="").data
     listed = {name for kind in inventory if kind.startswith("py:") for name in inventory[kind]}
     for one in find_names():

@@ -8,13 +8,13 @@ from functools import cache
 from typing import Any
 
 from docutils import nodes
-from latex2mathml.converter import convert
 from sphinx.addnodes import pending_xref
 from sphinx.application import Sphinx
 from sphinx.environment import BuildEnvironment
 from sphinx.util.inspect import stringify_signature
 
-from website.names import find_home, find_names, find_pages, is_package
+from website.equations import to_mathml
+from website.names import find_home, find_names, find_pages, is_package, list_aliases
 
 
 def setup(app: Sphinx) -> dict[str, Any]:
@@ -24,11 +24,6 @@ def setup(app: Sphinx) -> dict[str, Any]:
     app.connect("autodoc-process-signature", _write_signature)
     app.connect("html-page-context", _share_sidebar, priority=100)
     return {"parallel_read_safe": True, "parallel_write_safe": True}
-
-
-def to_mathml(latex: str, display: bool = False) -> str:
-    """Return an equation as MathML, which browsers draw themselves."""
-    return convert(latex, display="block" if display else "inline")
 
 
 def _visit_math(visitor: Any, node: nodes.math) -> None:
@@ -57,19 +52,11 @@ def _find_reference(
     return domain.resolve_xref(env, node["refdoc"], app.builder, "obj", home, node, content)
 
 
-@cache
-def _homes_by_name() -> dict[str, str | None]:
-    homes: dict[str, str | None] = {}
-    for one in find_names():
-        homes[one.name] = None if one.name in homes else one.home
-    return homes
-
-
 def _find_alone(target: str) -> str | None:
     """Return the home of ``Model`` or ``model.Model.fk``, from the last capitalised word on."""
     words = target.split(".")
     for i, word in enumerate(words):
-        if home := _homes_by_name().get(word):
+        if home := list_aliases().get(word):
             return ".".join([home, *words[i + 1 :]])
     return None
 
@@ -89,9 +76,7 @@ def _write_signature(
         found = inspect.signature(documented)
     except (TypeError, ValueError):
         return None
-    parameters = list(found.parameters.values())
-    if parameters and parameters[0].name in ("self", "cls"):
-        parameters = parameters[1:]
+    parameters = [one for one in found.parameters.values() if one.name[0] != "_" and one.name != "self"]
     text = stringify_signature(
         found.replace(parameters=parameters, return_annotation=inspect.Signature.empty), short_literals=True
     )

@@ -146,3 +146,16 @@ def find_home(path: str) -> str | None:
         path, _, last = path.rpartition(".")
         rest = f".{last}{rest}"
     return None
+
+
+@cache
+def list_aliases() -> dict[str, str]:
+    """Return the home of each capitalised name that only one public class has, for types in plain text."""
+    homes: dict[str, str] = {}
+    several = set()
+    for one in find_names():
+        if one.name in homes:
+            several.add(one.name)
+        if one.name[0].isupper():
+            homes[one.name] = one.home
+    return {name: home for name, home in homes.items() if name not in several}

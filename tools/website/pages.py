@@ -108,9 +108,16 @@ def translate_page(file: str, repository: str | None) -> str:
         label = link["text"]
         if target is None:
             return label if "\0" in label else f"`{label}`"
+        if label == posixpath.basename(link["target"]) and label.endswith(".md"):
+            label = read_title(_locate(file, link["target"]))
         return f"{link['image']}[{label}]({target})"
 
     return _outside_code(text, lambda part: LINK.sub(replace, part))
+
+
+def read_title(file: str) -> str:
+    """Return the title of a Markdown page."""
+    return (ROOT / file).read_text(encoding="utf-8").partition("\n")[0].removeprefix("# ")
 
 
 def _outside_code(text: str, change: Callable[[str], str]) -> str:

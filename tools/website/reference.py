@@ -9,7 +9,7 @@ from collections.abc import Iterator
 
 from sphinx.pycode import ModuleAnalyzer
 
-from website.names import PublicName, find_homes, find_modules, find_names, find_pages, is_package
+from website.names import PublicName, find_home, find_homes, find_modules, find_names, find_pages, is_package
 from website.pages import find_documents
 from website.uses import find_users
 
@@ -78,7 +78,7 @@ def _refer(home: str, text: str) -> str:
 
 
 def _write_name(one: PublicName) -> str:
-    parts = [":orphan:", _head(shorten(one.home))]
+    parts = [":orphan:", _head(one.name)]
     parts += [f"In {_refer(one.module, shorten(one.module))}." if not one.others else f"In {_refer(one.module, shorten(one.module))}; also as {', '.join(f'``{shorten(other)}``' for other in one.others)}."]
     parts.append(_document(one))
     return "\n\n".join(parts) + "\n"
@@ -88,7 +88,9 @@ def _document(one: PublicName) -> str:
     """Return the directives that document a name, and the pages that use it."""
     value = resolve(one.home)
     if inspect.isclass(value):
-        text = f".. autoclass:: {one.home}\n   :members:\n   :inherited-members: {BASES}\n   :show-inheritance:"
+        text = f".. autoclass:: {one.home}\n   :members:\n   :inherited-members: {BASES}"
+        if any(find_home(f"{base.__module__}.{base.__qualname__}") for base in value.__bases__):
+            text += "\n   :show-inheritance:"
     elif callable(value) and hasattr(value, "__code__"):
         text = f".. autofunction:: {one.home}"
     else:

@@ -233,8 +233,8 @@ class CompiledFunction(Generic[Results]):
         x
             A point per row, shape (N, n).
         out
-            Arrays for the results: contiguous, float64, of shape ``(N, *shape)``, one per output (alone if there
-            is a single output). New ones if None.
+            Arrays for the results: contiguous, float64, of shape ``(N, *shape)``, one per output (alone if
+            there is a single output). New ones if None.
 
         Returns
         -------

@@ -181,6 +181,7 @@ class Keep:
 
 
 Task: TypeAlias = Goal | Hold | Keep
+"""A task of a controller or of inverse kinematics."""
 
 
 def _describe(name: str, expression: object) -> str:
