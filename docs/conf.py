@@ -6,12 +6,13 @@ from pathlib import Path
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT / "tools"))
 
-from kineverse import __version__  # noqa: E402
 from website.names import list_aliases  # noqa: E402
+
+from kineverse import __version__  # noqa: E402
 
 project = "Kineverse"
 author = "The Kineverse developers"
-copyright = author
+copyright = author  # noqa: A001  - the name that Sphinx wants
 version = release = __version__
 
 extensions = ["myst_parser", "sphinx.ext.autodoc", "numpydoc", "website.extension"]

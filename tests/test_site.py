@@ -87,7 +87,12 @@ def test_homes_are_found_from_other_paths(path: str, home: str | None) -> None:
         ("docs/models.md", "#poses", None, "#poses"),
         ("README.md", "LICENSE", None, None),
         ("README.md", "LICENSE", "https://example.org/kv", "https://example.org/kv/blob/main/LICENSE"),
-        ("docs/models.md", "../tools/fuzz", "https://example.org/kv", "https://example.org/kv/tree/main/tools/fuzz"),
+        (
+            "docs/models.md",
+            "../tools/fuzz",
+            "https://example.org/kv",
+            "https://example.org/kv/tree/main/tools/fuzz",
+        ),
     ],
 )
 def test_links_lead_to_pages_or_to_the_repository(
@@ -117,7 +122,9 @@ def test_equations_of_the_pages_are_understood() -> None:
 
     count = 0
     for file in PAGES:
-        text = re.sub(r"^```.*?^```$|`[^`]*`", "", (ROOT / file).read_text(encoding="utf-8"), flags=re.M | re.S)
+        text = re.sub(
+            r"^```.*?^```$|`[^`]*`", "", (ROOT / file).read_text(encoding="utf-8"), flags=re.M | re.S
+        )
         for latex in re.findall(r"\$\$(.*?)\$\$", text, re.DOTALL) + re.findall(r"(?<!\$)\$([^$]+)\$", text):
             count += 1
             assert to_mathml(latex, display=True).startswith("<math")

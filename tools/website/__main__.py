@@ -14,17 +14,17 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from sphinx.cmd.build import build_main  # noqa: E402
+from sphinx.cmd.build import build_main
 
-from website.check import check_site  # noqa: E402
-from website.names import ROOT  # noqa: E402
-from website.pages import find_documents, find_repository, list_toctrees, translate_page, write_script  # noqa: E402
-from website.reference import link_names, write_reference  # noqa: E402
-from website.uses import find_uses  # noqa: E402
+from website.check import check_site
+from website.names import ROOT
+from website.pages import find_documents, find_repository, list_toctrees, translate_page, write_script
+from website.reference import link_names, write_reference
+from website.uses import find_uses
 
 
 def write_sources(folder: Path) -> None:
-    """Write all pages to a folder; those that have not changed stay, so that Sphinx need not read them again."""
+    """Write all pages to a folder; those that have not changed stay, and Sphinx need not read them again."""
     wanted = dict(_list_sources())
     for file in [path for path in folder.rglob("*") if path.is_file()]:
         if file.relative_to(folder).as_posix() not in wanted:

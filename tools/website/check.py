@@ -32,7 +32,9 @@ def _list_missing_names(site: Path) -> Iterator[str]:
 
 
 def _check_pages(site: Path) -> Iterator[str]:
-    pages = {path.relative_to(site).as_posix(): path.read_text(encoding="utf-8") for path in site.rglob("*.html")}
+    pages = {
+        path.relative_to(site).as_posix(): path.read_text(encoding="utf-8") for path in site.rglob("*.html")
+    }
     anchors = {page: set(_IDS.findall(text)) for page, text in pages.items()}
     files = {path.relative_to(site).as_posix() for path in site.rglob("*")}
     for page, text in pages.items():
@@ -45,7 +47,9 @@ def _check_pages(site: Path) -> Iterator[str]:
             yield f"{path.relative_to(site)}: it fetches {address}"
 
 
-def find_problem(page: str, tag: str, target: str, files: set[str], anchors: dict[str, set[str]]) -> str | None:
+def find_problem(
+    page: str, tag: str, target: str, files: set[str], anchors: dict[str, set[str]]
+) -> str | None:
     """Return what is wrong with where a tag of a page leads."""
     if re.match(r"(https?:)?//", target):
         return None if tag.startswith("<a ") else f"it fetches {target}"

@@ -16,6 +16,6 @@ def to_mathml(latex: str, display: bool = False) -> str:
         For a command that is unknown.
     """
     drawn = convert(latex, display="block" if display else "inline")
-    if unknown := re.search(r"\\\w+", re.sub(r"<[^>]*>", "", drawn)):
+    if unknown := re.search(r"\\\w+|&(?!#?\w+;)", re.sub(r"<[^>]*>", "", drawn)):
         raise ValueError(f"{unknown[0]} is unknown in {latex!r}")
     return drawn

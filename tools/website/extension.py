@@ -62,7 +62,13 @@ def _find_alone(target: str) -> str | None:
 
 
 def _write_signature(
-    app: Sphinx, what: str, name: str, documented: Any, options: Any, signature: str | None, returns: str | None
+    app: Sphinx,
+    what: str,
+    name: str,
+    documented: Any,
+    options: Any,
+    signature: str | None,
+    returns: str | None,
 ) -> tuple[str, str | None] | None:
     """Return a signature with the types as the source has them, where names of types are not yet replaced."""
     if signature is None or what not in ("class", "exception", "function", "method"):

@@ -105,7 +105,7 @@ def _rank(path: str, definition: str) -> tuple[int, bool, str]:
 
 @cache
 def find_pages() -> dict[str, str]:
-    """Return the page of each public module and name: that of its own, or of its module if that is no package.
+    """Return the page of each public module and name: one of its own, or that of a module without packages.
 
     Names of files differ in more than case, as some file systems want it.
     """

@@ -9,7 +9,6 @@ import tomllib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cache
-from pathlib import Path
 
 from website.names import ROOT
 
@@ -100,7 +99,7 @@ def translate_link(file: str, target: str, repository: str | None) -> str | None
 
 
 def translate_page(file: str, repository: str | None) -> str:
-    """Return a Markdown page with its links as the site needs them; those that lead nowhere become plain text."""
+    """Return a Markdown page with its links as the site needs them; those that lead nowhere become text."""
     text = (ROOT / file).read_text(encoding="utf-8")
 
     def replace(link: re.Match[str]) -> str:

@@ -16,7 +16,7 @@ _BLOCK = re.compile(r"^```python\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 
 @cache
 def find_uses() -> dict[str, set[str]]:
-    """Return the homes of the public names that each file of the repository uses that is a page of the site."""
+    """Return the homes of the public names that each file uses, for all files that are pages of the site."""
     return {file: set(list_names(_read_code(file))) for file in find_documents()}
 
 

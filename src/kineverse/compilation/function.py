@@ -239,7 +239,7 @@ class CompiledFunction(Generic[Results]):
         Returns
         -------
         numpy.ndarray or tuple of numpy.ndarray
-            An array of shape ``(N, *shape)`` per output; for a function of a single expression that array alone.
+            An array of shape ``(N, *shape)`` per output; for a function of one expression that array alone.
 
         Raises
         ------

@@ -33,7 +33,7 @@ FRAMES, BODIES, ARTICULATIONS, CONSTRAINTS, RATES, DATA = KINDS
 
 
 class _Signature:
-    """Signature of an operation for ``inspect``: that of ``__init__``, since its ``__new__`` takes anything."""
+    """Signature of an operation: that of ``__init__``, as ``__new__`` takes anything."""
 
     def __get__(self, operation: object, owner: type) -> inspect.Signature:
         found = inspect.signature(owner.__init__)  # type: ignore[misc]

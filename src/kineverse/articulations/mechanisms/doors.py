@@ -213,7 +213,7 @@ def _on(point: Point) -> Pose:
 class GarageDoor(Mechanism, document_kind="GarageDoor"):
     """Garage door: the lower edge moves along a vertical rail, the upper edge along one under the ceiling.
 
-    2022 paper, Eqs. 11-13. With the length l and the angle α, 0 when closed,
+    2022 paper, Eqs. 11-13. With the length l and the angle α, 0 when closed::
 
         base_T_door = translation(0, 0, l (1 - cos α)) · rotation_y(α)
 
