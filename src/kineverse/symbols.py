@@ -33,11 +33,14 @@ __all__ = [
 ]
 
 Role: TypeAlias = Literal["dof", "parameter", "contact", "location"]
+"""Kind of variable that a symbol stands for."""
 
 ROLES: tuple[Role, ...] = get_args(Role)
+"""All roles of symbols."""
 _UNPRINTABLE = re.compile("[\x00-\x1f\ud800-\udfff]")
 _ORDER = re.compile("0|[1-9][0-9]{0,8}")
 ORDER_NAMES = ("position", "velocity", "acceleration", "jerk", "snap")
+"""Names of the orders of time derivatives, as they stand after the colon of a name."""
 
 _INTERNED: dict[tuple[str, int, str, float | None], Symbol] = {}
 _INTERNING = threading.Lock()

@@ -260,13 +260,13 @@ class CompiledFunction(Generic[Results]):
         x
             A point per row, shape (N, n).
         out
-            Arrays for the results: contiguous, float64, of shape (N, *shape), one per output (alone if there
-            is a single output). New ones if None.
+            Arrays for the results: contiguous, float64, of shape ``(N, *shape)``, one per output (alone if
+            there is a single output). New ones if None.
 
         Returns
         -------
         numpy.ndarray or tuple of numpy.ndarray
-            An array of shape (N, *shape) per output; for a function of a single expression that array alone.
+            An array of shape ``(N, *shape)`` per output; for a function of one expression that array alone.
 
         Raises
         ------
