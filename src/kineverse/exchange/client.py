@@ -100,6 +100,23 @@ class LiveModel(Model, Closing):
     stored, or raises and nothing has happened. Commits of others arrive in the background. Listeners are
     called in a thread of their own, in order, and may edit. The version is the server's revision. While the
     server is away, reading goes on and edits raise; afterwards the model catches up.
+
+    Examples
+    --------
+    >>> server = kv.exchange.serve("kitchen", name="doc-live")
+    >>> model = kv.load(server.address)  # usually in another process
+    >>> with model.edit() as edit:
+    ...     edit.add_frame("lamp", parent="kitchen/sink_area", transform=kv.translation(0, 0, 1))
+    'frame lamp'
+    >>> "lamp" in server.snapshot().frames
+    True
+    >>> model.close()
+    >>> server.close()
+    >>> with model.edit() as edit:
+    ...     edit.add_frame("bulb", parent="lamp")
+    Traceback (most recent call last):
+        ...
+    kineverse.errors.OfflineError: The connection to live:doc-live was closed, or its model was not ...
     """
 
     def __init__(self, connection: Connection, wish: protocol.JoinRequest) -> None:
@@ -168,6 +185,15 @@ class LiveModel(Model, Closing):
         ------
         ConflictError
             If the last attempt was in conflict as well.
+
+        Examples
+        --------
+        >>> server = kv.exchange.serve("kitchen", name="doc-transact")
+        >>> model = kv.load(server.address)
+        >>> model.transact(lambda edit: edit.write("owner", "Ada"))
+        'data owner'
+        >>> model.close()
+        >>> server.close()
         """
         for done in range(as_count("attempts", attempts, 1)):
             try:
@@ -205,6 +231,19 @@ class LiveModel(Model, Closing):
             If there is no such revision, or this thread edits the model.
         OfflineError
             If the server is away.
+
+        Examples
+        --------
+        >>> server = kv.exchange.serve("kitchen", name="doc-undo")
+        >>> model = kv.load(server.address)
+        >>> with model.edit() as edit:
+        ...     edit.write("owner", "Ada")
+        'data owner'
+        >>> model.undo(model.version)
+        >>> "owner" in model.data
+        False
+        >>> model.close()
+        >>> server.close()
         """
         connection = self.exchange
         wanted = as_count("revision", revision, 1)
@@ -228,6 +267,21 @@ class LiveModel(Model, Closing):
             If this thread edits the model.
         OfflineError
             If the connection was closed, or is meanwhile, and the model does not have the version.
+
+        Examples
+        --------
+        >>> server = kv.exchange.serve("kitchen", name="doc-wait")
+        >>> one, other = kv.load(server.address), kv.load(server.address)
+        >>> with one.edit() as edit:
+        ...     edit.write("owner", "Ada")
+        'data owner'
+        >>> other.wait(one.version, timeout=60)
+        True
+        >>> other.data["owner"]
+        'Ada'
+        >>> one.close()
+        >>> other.close()
+        >>> server.close()
         """
         wanted, connection = as_count("version", version, 0), self.exchange
         self._check_not_edited()

@@ -118,6 +118,10 @@ class Calibration:
         left out, each in one of several parts, by the model from the others.
     looks
         Number of looks.
+
+    See Also
+    --------
+    kineverse.estimation.calibrate
     """
 
     state: State
@@ -299,6 +303,21 @@ def calibrate(
         For observations of the wrong shape.
     NoSolutionError
         If the steps do not converge.
+
+    Examples
+    --------
+    >>> model = kv.load("kitchen")
+    >>> door = model.fk("kitchen/fridge_door")
+    >>> seen = {q: door({"kitchen/fridge_door": q + 0.05}) for q in (0.1, 0.5, 0.9)}  # its zero is off
+    >>> looks = [
+    ...     kv.estimation.Look({"kitchen/fridge_door": q}, {"kitchen/fridge_door": pose})
+    ...     for q, pose in seen.items()
+    ... ]
+    >>> result = kv.estimation.calibrate(
+    ...     model, looks, "offsets kitchen/fridge_door", noise=(0.001, 0.01), held_out=0
+    ... )
+    >>> round(result.state["kitchen/fridge_door/offset"], 4)
+    0.05
     """
     if not isinstance(model, Model):
         raise InvalidValueError(f"A model is calibrated, as from kv.load(...), not {model!r:.60}.")

@@ -81,6 +81,10 @@ class Fit:
     misfit
         Size of the residuals relative to the stated noise, or to the noise that was estimated: about 1 if the
         family and the noise are right. NaN for a family that leaves no residuals, such as ``free``.
+
+    See Also
+    --------
+    kineverse.estimation.identify
     """
 
     family: str
@@ -233,6 +237,10 @@ class IdentificationResult:
         stated.
     reason
         Reason why the best family is not sure although it is probable, see :mod:`.model_check`, else empty.
+
+    See Also
+    --------
+    kineverse.estimation.identify
     """
 
     lazy_fits: tuple[LazyFit, ...]

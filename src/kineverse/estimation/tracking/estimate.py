@@ -145,6 +145,10 @@ class Estimate:
         Number of model evaluations; at 50 the iteration stopped without convergence.
     stamp
         Time [s]; None if unknown.
+
+    See Also
+    --------
+    kineverse.estimation.Tracker
     """
 
     def __init__(self, now: TrackerState, update_step: UpdateStep) -> None:

@@ -62,6 +62,10 @@ class MotionFinding:
         What was measured, what is accepted, and the unit of both: m, rad, kg/m³ or ``1``; None without one.
     state
         Values of coordinates at which it was measured; the others are at their default.
+
+    See Also
+    --------
+    kineverse.geometry.check_motion
     """
 
     kind: str
@@ -106,6 +110,10 @@ class CoordinateReport:
         Name of the coordinate; empty for the bodies that nothing moves.
     entries
         Everything, in the order of the checks.
+
+    See Also
+    --------
+    kineverse.geometry.check_motion
     """
 
     name: str
@@ -155,6 +163,10 @@ class MotionReport:
         A report for each degree of freedom, in the order of the model.
     at_rest
         The report of the bodies that nothing moves.
+
+    See Also
+    --------
+    kineverse.geometry.check_motion
     """
 
     coordinates: tuple[CoordinateReport, ...]
