@@ -100,6 +100,16 @@ def parse_length(text: str) -> float:
     return parse_value(text)
 
 
+def parse_pose_numbers(texts: Sequence[str]) -> tuple[float, ...]:
+    """Return the numbers of X, Y, Z [m], and of ROLL, PITCH, YAW [rad] that may follow."""
+    for text in texts[3:]:
+        if unit_kind(text) == "m":
+            raise InvalidValueError(
+                f"{text.strip()!r} is not an angle; write a number of rad (0.5), or 30deg"
+            )
+    return (*map(parse_length, texts[:3]), *map(parse_value, texts[3:]))
+
+
 def parse_value(text: str) -> float:
     """Return number [rad] or [m] of a text such as ``0.3``, ``-pi/2``, ``1.5pi``, ``30deg``, ``12 cm``."""
     match = _VALUE_PATTERN.fullmatch(text.strip())
@@ -227,6 +237,16 @@ def find_limit_notes(model: ModelView, values: Mapping[str, float], texts: Itera
             f"[{format_number(violation.lower)}, {format_number(violation.upper)}]"
         )
     return lines
+
+
+def check_assigned_units(model: ModelView, texts: Iterable[str], option: str) -> None:
+    """Raise InvalidValueError for a length that is assigned to an angle, and the other way round."""
+    given = {text.rpartition("=")[0].strip(): text for text in texts if has_unit(text)}
+    if not given:
+        return
+    values = {str(symbol): value for symbol, value in model.default_state().items()}
+    for name, unit in infer_units(model, values, given).items():
+        check_unit(option, given[name], name, unit)
 
 
 def check_unit(option: str, text: str | None, coordinate: object, unit: str) -> None:

@@ -96,7 +96,7 @@ def format_sections(summary: ModelSummary, frames: bool = False, constraints: bo
     sections = ["\n".join(lines)]
     if summary.freedoms:
         rows = [(name, unit, *map(format_number, numbers)) for name, unit, *numbers in summary.freedoms]
-        sections.append(format_table(("DoF", *DofSummary._fields[1:]), rows, "<<>>>>"))
+        sections.append(format_table(("DoF", *DofSummary._fields[1:-1], "speed [/s]"), rows, "<<>>>>"))
     if summary.interlocks:
         sections.append("\n".join(["interlocks", *(f"  {interlock}" for interlock in summary.interlocks)]))
     locking = {name for interlock in summary.interlocks for name in interlock.constraints}

@@ -29,6 +29,7 @@ from .arguments import (
     add_cache_options,
     add_model_options,
     add_set_option,
+    check_assigned_units,
     load_model,
     manage_cache,
     needs_mujoco,
@@ -110,6 +111,7 @@ def run(arguments: argparse.Namespace) -> int:
         model = load_model(arguments, arguments.model)
     for name in state:
         model.symbol(name)  # raises for unknown names, with similar ones
+    check_assigned_units(model, arguments.assignments, "--set")
     links = [LinkCover(body, items) for body, items in _objects(model, arguments).items()]
     for link in show_progress(links, "covering", "link"):
         _cover(link, protrusion, most, arguments.force)
