@@ -10,7 +10,7 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 import numpy.typing as npt
 
-from kineverse._rich_display import Html, element, html_table
+from kineverse._rich_display import Html, TableDisplay, element, html_table
 from kineverse.errors import InvalidValueError, UnknownNameError, suggest
 from kineverse.estimation.linear_algebra import invert_matrices, singularity_named
 from kineverse.estimation.noise import Outliers
@@ -37,7 +37,7 @@ class NoiseDeviations(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Fit:
+class Fit(TableDisplay):
     """Most likely member of one joint family.
 
     Attributes
@@ -218,7 +218,7 @@ class LazyFit(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class IdentificationResult:
+class IdentificationResult(TableDisplay):
     """Fits of all families, the most probable first, each computed on first access.
 
     Attributes
