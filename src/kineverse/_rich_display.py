@@ -72,6 +72,17 @@ def shorten(text: str, most: int = CELL) -> str:
     return text if isinstance(text, Html) or len(text) <= most else f"{text[: most - 1]}…"
 
 
+class TableDisplay:
+    """Base of results that notebooks show as a table, and as their text where there is no HTML."""
+
+    def _repr_html_(self) -> str:
+        raise NotImplementedError
+
+    def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> dict[str, str]:
+        # A notebook keeps a plain text as well, and the repr has all numbers.
+        return {"text/plain": str(self), "text/html": self._repr_html_()}
+
+
 def folded(title: str, *content: str) -> Html:
     """Return content below a title that a click unfolds."""
     return element("details", element("summary", title), *content)

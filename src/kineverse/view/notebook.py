@@ -1,8 +1,8 @@
 """Models in notebooks: the page below a cell, with a picture where the page cannot be.
 
-A page ends with its kernel, and a browser elsewhere does not reach it, but a saved notebook is read anywhere. So
-each display has a picture. It is the content of the element ``object`` that embeds the page: browsers show it
-when the page does not answer, without a script, and readers of notebooks that drop such elements keep it.
+A page ends with its kernel, and a browser elsewhere does not reach it, but a saved notebook is read anywhere.
+So each display has a picture. It is the content of the element ``object`` that embeds the page: browsers show
+it when the page does not answer, without a script, and readers that drop such elements keep it.
 """
 
 from __future__ import annotations

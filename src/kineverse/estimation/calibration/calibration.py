@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from kineverse._checks import as_count, as_positive
-from kineverse._rich_display import element, html_table
+from kineverse._rich_display import TableDisplay, element, html_table
 from kineverse.errors import DuplicateNameError, InvalidValueError, UnknownNameError, list_some, suggest
 from kineverse.estimation.noise import Outliers, as_outliers
 from kineverse.formats.saver import save_corrections
@@ -90,7 +90,7 @@ _PREPARED: WeakKeyDictionary[Model, tuple[int, dict[tuple[Any, ...], _Prepared]]
 
 
 @dataclass(frozen=True, eq=False)
-class Calibration:
+class Calibration(TableDisplay):
     """Result of :func:`calibrate`: parameters, their uncertainty, and the corrected operations.
 
     Attributes

@@ -11,7 +11,7 @@ from typing import TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from kineverse._rich_display import html_table
+from kineverse._rich_display import TableDisplay, html_table
 from kineverse.articulations import Fixed, Floating
 from kineverse.errors import DuplicateNameError, InvalidValueError, ModelError
 from kineverse.estimation.identification.curve import CURVE
@@ -393,7 +393,7 @@ class KinematicEdge:
 
 
 @dataclass(frozen=True)
-class KinematicGraph:
+class KinematicGraph(TableDisplay):
     """Rigid bodies and the joints between them.
 
     Attributes

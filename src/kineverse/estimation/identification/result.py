@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from kineverse._names import answer_foreign_names
-from kineverse._rich_display import Html, element, html_table
+from kineverse._rich_display import Html, TableDisplay, element, html_table
 from kineverse._synonyms import IDENTIFICATION_SYNONYMS
 from kineverse.errors import InvalidValueError, UnknownNameError, suggest
 from kineverse.estimation.linear_algebra import invert_matrices, singularity_named
@@ -39,7 +39,7 @@ class NoiseDeviations(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Fit:
+class Fit(TableDisplay):
     """Most likely member of one joint family.
 
     Attributes
@@ -225,7 +225,7 @@ class LazyFit(NamedTuple):
 
 @answer_foreign_names("An identification", IDENTIFICATION_SYNONYMS)
 @dataclass(frozen=True, eq=False)
-class IdentificationResult:
+class IdentificationResult(TableDisplay):
     """Fits of all families, the most probable first, each computed on first access.
 
     Attributes
