@@ -40,7 +40,7 @@ numpydoc_xref_aliases = list_aliases()
 
 html_theme = "furo"
 pygments_dark_style = "github-dark"
-html_title = "Kineverse"
+html_title = f"Kineverse {version}"
 html_copy_source = False
 html_show_sourcelink = False
 html_show_sphinx = False

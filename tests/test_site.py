@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import json
 import re
 from collections import Counter
 from pathlib import Path
@@ -155,3 +156,37 @@ def test_names_are_found_in_code() -> None:
 def test_problems_of_built_pages_are_found(tag: str, target: str, problem: str | None) -> None:
     files, anchors = {"index.html", "api/a.html", "api/b.html"}, {"api/b.html": {"there"}}
     assert find_problem("api/a.html", tag, target, files, anchors) == problem
+
+
+def test_notebooks_are_pages_with_what_they_showed(tmp_path: Path) -> None:
+    pytest.importorskip("latex2mathml")
+    from website.notebooks import write_notebook
+
+    def code(source: str, **data: object) -> dict[str, object]:
+        return {
+            "cell_type": "code",
+            "source": [source],
+            "outputs": [{"output_type": "execute_result", "data": data}],
+        }
+
+    cells = [
+        {"cell_type": "markdown", "source": ["# A title\n", "and text"]},
+        code("x", **{"text/latex": [r"$\displaystyle \frac{a}{b}$"], "text/plain": ["a/b"]}),
+        code("y", **{"text/latex": [r"$\unheard{a}$"], "text/plain": ["a ``` b"]}),
+        code("z", **{"image/png": "aGVsbG8=", "text/plain": ["a picture"]}),
+        code("h", **{"text/html": ["<b>rich</b>"], "text/plain": ["plain"]}),
+        {
+            "cell_type": "code",
+            "source": ["print(1)"],
+            "outputs": [{"output_type": "stream", "text": ["1\n"]}],
+        },
+    ]
+    path = tmp_path / "first.ipynb"
+    path.write_text(json.dumps({"cells": cells}), encoding="utf-8")
+    page, pictures = write_notebook(path)
+    assert page == (
+        "# A title\nand text\n\n```python\nx\n```\n\n$$\n\\frac{a}{b}\n$$\n\n```python\ny\n```\n\n"
+        "````text\na ``` b\n````\n\n```python\nz\n```\n\n![](first_1.png)\n\n```python\nh\n```\n\n"
+        "```{raw} html\n<b>rich</b>\n```\n\n```python\nprint(1)\n```\n\n```text\n1\n```\n"
+    )
+    assert pictures == {"first_1.png": b"hello"}

@@ -18,18 +18,22 @@ from sphinx.cmd.build import build_main
 
 from website.check import check_site
 from website.names import ROOT
-from website.pages import find_documents, find_repository, list_toctrees, translate_page, write_script
+from website.notebooks import write_notebook
+from website.pages import (
+    find_documents,
+    find_repository,
+    list_toctrees,
+    translate_links,
+    translate_page,
+    write_script,
+)
 from website.reference import link_names, write_reference
 from website.uses import find_uses
 
 
 def write_sources(folder: Path) -> None:
     """Write all pages to a folder; those that have not changed stay, and Sphinx need not read them again."""
-    wanted = dict(_list_sources())
-    for file in [path for path in folder.rglob("*") if path.is_file()]:
-        if file.relative_to(folder).as_posix() not in wanted:
-            file.unlink()
-    for place, content in wanted.items():
+    for place, content in _list_sources():
         path = folder / place
         if not path.exists() or path.read_bytes() != content:
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -39,7 +43,12 @@ def write_sources(folder: Path) -> None:
 def _list_sources() -> Iterator[tuple[str, bytes]]:
     repository = find_repository()
     for file, place in find_documents().items():
-        if file.endswith(".md"):
+        if file.endswith(".ipynb"):
+            text, pictures = write_notebook(ROOT / file)
+            for name, picture in pictures.items():
+                yield f"{Path(place).parent}/{name}", picture
+            text = translate_links(file, text, repository)
+        elif file.endswith(".md"):
             text = translate_page(file, repository) + list_toctrees(file)
         else:
             text = write_script(file, link_names(file, find_uses()[file]))
@@ -55,11 +64,11 @@ def main() -> int:
     parser = argparse.ArgumentParser(
         prog="make docs", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--fresh", action="store_true", help="build all pages anew")
+    parser.add_argument("--changed", action="store_true", help="build only pages that have changed")
     parser.add_argument("--jobs", default="auto", help="processes (one for each core)")
     arguments = parser.parse_args()
     sources, doctrees, site = (ROOT / "build" / name for name in ("site-source", "site-doctrees", "site"))
-    if arguments.fresh:
+    if not arguments.changed:
         for folder in (sources, doctrees, site):
             shutil.rmtree(folder, ignore_errors=True)
     write_sources(sources)

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable
-from functools import cache
+from functools import cache, partial
 from typing import Any
 
 from docutils import nodes
+from jinja2.bccache import Bucket, BytecodeCache
+from jinja2.sandbox import SandboxedEnvironment
+from numpydoc import docscrape_sphinx
 from sphinx.addnodes import pending_xref
 from sphinx.application import Sphinx
 from sphinx.environment import BuildEnvironment
@@ -21,7 +24,8 @@ def setup(app: Sphinx) -> dict[str, Any]:
     """Connect everything."""
     app.add_html_math_renderer("mathml", (_visit_math, None), (_visit_display, None))
     app.connect("missing-reference", _find_reference)
-    app.connect("autodoc-process-signature", _write_signature)
+    app.connect("autodoc-process-signature", _write_signature, priority=100)  # before numpydoc
+    docscrape_sphinx.SandboxedEnvironment = partial(SandboxedEnvironment, bytecode_cache=_CompiledTemplates())
     app.connect("html-page-context", _share_sidebar, priority=100)
     return {"parallel_read_safe": True, "parallel_write_safe": True}
 
@@ -106,6 +110,22 @@ def _homes_by_page() -> dict[str, str]:
     """Return the page of the module of each page of a name."""
     pages = find_pages()
     return {pages[one.home]: pages[one.module] for one in find_names() if is_package(one.module)}
+
+
+class _CompiledTemplates(BytecodeCache):
+    """Compiled templates of numpydoc, which would else compile them for each docstring."""
+
+    def __init__(self) -> None:
+        self._code: dict[str, bytes] = {}
+
+    def load_bytecode(self, bucket: Bucket) -> None:
+        """Fill a bucket."""
+        if bucket.key in self._code:
+            bucket.bytecode_from_string(self._code[bucket.key])
+
+    def dump_bytecode(self, bucket: Bucket) -> None:
+        """Keep a bucket."""
+        self._code[bucket.key] = bucket.bytecode_to_string()
 
 
 @cache

@@ -45,6 +45,9 @@ def find_documents() -> dict[str, str]:
             places[file] = file
         else:
             places[f"{file}.py"] = file
+    for path in sorted((ROOT / "examples" / "notebooks").glob("*.ipynb")):
+        file = path.relative_to(ROOT).as_posix()
+        places[file] = file.removesuffix(".ipynb")
     return places
 
 
@@ -100,7 +103,11 @@ def translate_link(file: str, target: str, repository: str | None) -> str | None
 
 def translate_page(file: str, repository: str | None) -> str:
     """Return a Markdown page with its links as the site needs them; those that lead nowhere become text."""
-    text = (ROOT / file).read_text(encoding="utf-8")
+    return translate_links(file, (ROOT / file).read_text(encoding="utf-8"), repository)
+
+
+def translate_links(file: str, text: str, repository: str | None) -> str:
+    """Return the text of a file with its links as the site needs them; see :func:`translate_page`."""
 
     def replace(link: re.Match[str]) -> str:
         target = translate_link(file, link["target"], repository)
@@ -141,21 +148,23 @@ def list_toctrees(file: str) -> str:
     if file == INDEX:
         sections = find_sections()
     elif file == "examples/README.md":
-        text = (ROOT / file).read_text(encoding="utf-8")
-        scripts = [_locate(file, link["target"]) for link in LINK.finditer(text)]
-        sections = (Section("", tuple(("", one) for one in scripts if one.startswith("examples/"))),)
+        below = [one for one in find_documents() if one.startswith("examples/") and one != file]
+        sections = (Section("", tuple((_name_example(one), one) for one in below)),)
     else:
         return ""
     return "".join(f"\n{one}\n" for one in map(_format_toctree, sections))
 
 
+def _name_example(file: str) -> str:
+    """Return a short title for the sidebar: that of a file, after the library that it comes from."""
+    folder, _, name = file.removeprefix("examples/").rpartition("/")
+    title = name.partition(".")[0].replace("_", " ")
+    return f"{folder.removeprefix('from_')}: {title}" if folder.startswith("from_") else title
+
+
 def _format_toctree(section: Section) -> str:
     documents = find_documents()
-    entries = [
-        f"{title} </{documents[file]}>" if title else f"/{documents[file]}"
-        for title, file in section.pages
-        if file in documents
-    ]
+    entries = [f"{title} </{documents[file]}>" for title, file in section.pages if file in documents]
     if section.caption == "Reference":
         entries.insert(0, "Python API </api/index>")
     caption = [f":caption: {section.caption}"] if section.caption else []

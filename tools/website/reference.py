@@ -22,8 +22,8 @@ from website.names import (
 from website.pages import find_documents
 from website.uses import find_users
 
-BASES = (
-    "object, ABC, Mapping, Sequence, Struct, tuple, dict, str, int, Enum, BaseException, Protocol, Generic"
+BASES = ", ".join(
+    "object ABC Protocol Generic Mapping Sequence Struct Enum BaseException tuple dict str int".split()
 )
 """Classes of other people: what a class of ours has from them stands in their own documentation."""
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import json
 import re
 from collections import defaultdict
 from collections.abc import Iterator
@@ -65,4 +66,7 @@ def _read_code(file: str) -> str:
     if path.is_dir():
         return "\n".join(one.read_text(encoding="utf-8") for one in sorted(path.glob("*.py")))
     text = path.read_text(encoding="utf-8")
+    if file.endswith(".ipynb"):
+        cells = (cell["source"] for cell in json.loads(text)["cells"] if cell["cell_type"] == "code")
+        return "\n".join("".join(cell) for cell in cells)
     return "\n".join(_BLOCK.findall(text)) if file.endswith(".md") else text
