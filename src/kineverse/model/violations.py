@@ -58,7 +58,7 @@ class Violations(tuple[Violation, ...]):
 
     def __repr__(self) -> str:
         lines = [
-            f"  {v.name}: {v.lower:g} <= {v.value:g} <= {v.upper:g} "
+            f"  {v.name}: {v.lower + 0:g} <= {v.value + 0:g} <= {v.upper + 0:g} "  # without the sign of -0
             + ("has no value here" if math.isnan(v.excess) else f"is off by {v.excess:g}")
             for v in self
         ]
