@@ -121,6 +121,12 @@ def picture(
         If lines are wanted and the extra ``geometry`` is not installed.
     InvalidValueError
         If the size is not that of a picture.
+
+    Examples
+    --------
+    >>> pixels = kv.view.picture(kv.load("shelf_door"), {"shelf_door/door": 0.8}, size=(64, 48))
+    >>> pixels.shape, pixels.dtype
+    ((48, 64, 3), dtype('uint8'))
     """
     width, height = size
     if width < 1 or height < 1 or width * height * SAMPLES**2 > LARGEST:
@@ -180,7 +186,12 @@ def join_pictures(rows: Sequence[Sequence[npt.NDArray[np.uint8]]], gap: int = 4)
 
 
 def save_picture(path: str | Path, model: ModelView, state: StateLike | None = None, **options: Any) -> None:
-    """Write :func:`picture` of a model, with the same options, to a PNG file."""
+    """Write :func:`picture` of a model, with the same options, to a PNG file.
+
+    Examples
+    --------
+    >>> kv.view.save_picture("shelf.png", kv.load("shelf_door"), {"shelf_door/door": 0.8}, size=(64, 48))
+    """
     write_png(path, picture(model, state, **options))
 
 

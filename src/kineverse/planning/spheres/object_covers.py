@@ -44,6 +44,10 @@ def cover_objects(
     ------
     KineverseError
         If a shape cannot be used, or is a triangle mesh; the message names the body.
+
+    See Also
+    --------
+    kineverse.planning.spheres.cover_solids
     """
     solids, key = _request(items, protrusion, most)
     result = None if force else find_cover(key)
