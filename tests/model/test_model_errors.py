@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -104,7 +103,7 @@ MESSAGES: dict[str, tuple[Callable[[kv.Model], Any], str]] = {
     ),
     "a number that stays fixed": (
         lambda m: m.project(m.default_state(), fixed=5),  # type: ignore[arg-type]
-        "What stays fixed is given as names of coordinates, not as 5.",
+        "fixed=: A coordinate is given by its name, a text, not by 5.",
     ),
     "a state of another model": (
         lambda m: m.violations(kv.State({"dor": 9.0})),
@@ -253,27 +252,6 @@ def test_attributes_are_missing_as_python_has_it() -> None:
         assert getattr(thing, "__wrapped__", None) is None
         with pytest.raises(AttributeError):
             getattr(thing, "_private_thing")  # noqa: B009 - an attribute, asked for
-
-
-def test_names_of_others_are_no_names_here() -> None:
-    from kineverse._synonyms import EDIT_SYNONYMS, MODEL_SYNONYMS, MODULE_SYNONYMS, STATE_SYNONYMS
-
-    edit: list[kv.model.Edit] = []
-    edited(edit.append)(room())
-    for owner, names in (
-        (kv, MODULE_SYNONYMS),
-        (room(), MODEL_SYNONYMS),
-        (edit[0], EDIT_SYNONYMS),
-        (kv.State(), STATE_SYNONYMS),
-    ):
-        assert not [name for name in names if name in dir(owner)]
-    for words in MODULE_SYNONYMS.values():
-        for name in (word.rstrip(",") for word in words.split() if word.startswith("kv.")):
-            assert attrgetter(name.removeprefix("kv."))(kv) is not None
-    for words in (*MODEL_SYNONYMS.values(), *STATE_SYNONYMS.values()):
-        for owner, name in ((room(), "model."), (kv.State(), "state.")):
-            for word in (w for w in words.split() if w.startswith(name)):
-                assert word.removeprefix(name).partition("(")[0].rstrip(",;") in dir(owner)
 
 
 def test_the_end_of_a_long_chain() -> None:
