@@ -28,7 +28,7 @@ FOLDER = Path(__file__).resolve().parents[1] / "examples" / "notebooks"
 
 TIMEOUT = 300  # longest time of a cell [s]; the slowest takes three
 
-_METADATA = {
+METADATA = {
     "kernelspec": {"display_name": "Python 3", "language": "python", "name": "python3"},
     "language_info": {"name": "python"},
 }
@@ -72,7 +72,7 @@ def run_notebook(notebook: Any, kernel: KernelManager) -> Any:
         reset.source += f"\nimport os; os.chdir({folder!r})"
         NotebookClient(new, km=kernel, timeout=TIMEOUT, record_timing=False).execute()
     new.cells = new.cells[1:]
-    new.metadata = nbformat.from_dict(_METADATA)
+    new.metadata = nbformat.from_dict(METADATA)
     count = 0
     for cell in new.cells:
         cell.metadata = nbformat.from_dict({})

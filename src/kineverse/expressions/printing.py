@@ -96,7 +96,7 @@ def gradient_latex(gradient: Mapping[Symbol, Expression], trends: frozenset[Symb
         Keys whose entries are trends.
     """
     if not gradient:
-        return r"D = \left\{\right\}"
+        return r"\text{no entries}"
     for limit in (_LONGEST_FORMULA // 4, 200, 50):
         writer, lines = _Latex(limit), []
         for speed, entry in islice(gradient.items(), _ENTRIES):

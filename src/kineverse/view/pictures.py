@@ -132,14 +132,16 @@ def picture(
     if width < 1 or height < 1 or width * height * SAMPLES**2 > LARGEST:
         raise InvalidValueError(f"a picture of {width} x {height} pixels cannot be made")
     poses, values = FramePoses(model), complete(model, state)
-    at = dict(zip(poses.names, poses.evaluate(values), strict=True))
+    matrices = poses.evaluate(values)
+    at = dict(zip(poses.names, matrices, strict=True))
+    for frame in poses.unplaced(matrices):  # Its bodies are not drawn, as on the page.
+        del at[frame]
     found = None if near is None else ProximityQuery(model, decomposed).evaluate(values, near)
     items = collect_drawables(model, "collision" if collisions else "visual", decomposed)
-    items += overlay
+    items, front = ([part for part in parts if part.frame in at] for parts in ([*items, *overlay], over))
     scene = TriangleSoup.from_drawables(items, at)
     if camera is None:
         camera = choose_camera(scene, weigh_drawables(model, items), at, width / height)
-    front = list(over)
     if frames or not len(scene.corners):
         front += create_axes(model, scene.corners, at)
     if found is not None:
