@@ -18,12 +18,13 @@ TEST := $(patsubst %,requirements/%.txt,peers test learning usd check notebooks)
 WHEELS := $(shell $(PYTHON) -c 'import platform as p; print(p.system(), p.machine(), *p.python_version_tuple()[:2])')
 ROS := $(if $(and $(filter Linux-x86_64-3-11,$(subst $() ,-,$(WHEELS))),$(shell command -v cmake),$(shell command -v c++)),$(VENV)/ros.installed)
 
-.PHONY: help demo test ros sanitize fuzz faults release format clean
+.PHONY: help demo test docs ros sanitize fuzz faults release format clean
 .NOTPARALLEL:
 
 help:
 	@echo "make demo    a robot opens and closes a kitchen, live in the browser (ARGS=--headless: a table, a picture, and end)"
 	@echo "make test    formatter, linter, types, layers, tests"
+	@echo "make docs    the documentation as pages that need no network: build/site/index.html"
 	@echo "make ros     an environment with ROS 2, .venv/ros, for kineverse ros without an installation of it"
 	@echo "make sanitize  all C with sanitizers, and the tests that use it (ARGS=--short: a little of each)"
 	@echo "make fuzz    look for inputs that break a reader (ARGS='--target sdf --minutes 60')"
@@ -46,6 +47,9 @@ test: $(VENV)/test.installed $(ROS)
 	@# The tests of a file share what takes long to make, so that they stay in one process.
 	$(BIN)/python -m pytest -q -n $(JOBS) --dist loadfile --no-loadscope-reorder --assert=plain $(ARGS) || \
 	    { $(BIN)/python -m pytest -q --last-failed --last-failed-no-failures=none $(ARGS); exit 1; }
+
+docs: $(VENV)/docs.installed
+	$(BIN)/python tools/website --jobs $(JOBS) $(ARGS)
 
 ros: $(VENV)/ros.installed
 
@@ -99,6 +103,11 @@ $(VENV)/release.installed: requirements/release.txt | $(BIN)/python
 	@$(BIN)/python -m venv --clear $(VENV)/release
 	@$(BIN)/python -m pip --python $(VENV)/release/bin/python install --quiet --no-input --disable-pip-version-check \
 	    --no-deps --require-hashes -r requirements/release.txt
+	@touch $@
+
+# Sphinx imports what it documents, the parts for other libraries as well.
+$(VENV)/docs.installed: requirements/docs.txt $(VENV)/test.installed
+	@$(INSTALL_FILES)
 	@touch $@
 
 $(VENV)/fuzz.installed: requirements/fuzz.txt $(VENV)/test.installed

@@ -57,7 +57,9 @@ def test_a_skill_moves_an_object_through_topics_alone(ros_python, tmp_path, monk
         cwd=tmp_path, stdout=subprocess.PIPE, text=True,
     )  # fmt: skip
     try:
-        assert simulated.stdout.readline().startswith("robot: arm in the kinematic world")
+        said = [simulated.stdout.readline().strip() for _ in range(4)]
+        assert said[0].startswith("robot: arm in the kinematic world")
+        assert said[3] == "velocity_controller/commands has the speeds of slide"
         words = ["--what", "flap", "--hand", "arm/finger", "--to", "3cm", "--world", "ros", "--json"]
         done = subprocess.run(
             [ros_python, "-m", "kineverse", "push", *robot, *words],

@@ -7,10 +7,11 @@ from hypothesis import strategies as st
 from small_models import cabinet, dependent
 
 import kineverse as kv
+from kineverse.model.kinematics import infer_units
 from kineverse.view.animation import RangeAnimation
 from kineverse.view.html import MOST_LINES, format_failure, format_violations
 from kineverse.view.poses import FramePoses, complete, roll_pitch_yaw, to_wxyz
-from kineverse.view.sliders import Ranges, choose_slider_range, choose_slider_step, infer_units
+from kineverse.view.sliders import Ranges, choose_slider_range, choose_slider_step
 
 INF = math.inf
 LIMIT = st.one_of(st.floats(-10, 10), st.just(INF), st.just(-INF))

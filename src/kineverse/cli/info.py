@@ -24,12 +24,11 @@ from kineverse.geometry.objects import bodies_with_visual_collision
 from kineverse.geometry.shapes import import_coal
 from kineverse.lie import to_quaternion
 from kineverse.model.constraint import Constraint
+from kineverse.model.display import DofSummary, order_depth_first, summarize_freedoms
 from kineverse.model.model_view import ModelView
 from kineverse.reasoning import Interlocks, interlocks
-from kineverse.symbols import Symbol
 from kineverse.view.drawables import collect_drawables
 from kineverse.view.poses import FramePoses, complete, roll_pitch_yaw
-from kineverse.view.sliders import infer_units
 
 from .arguments import (
     add_model_options,
@@ -106,7 +105,7 @@ def format_sections(summary: ModelSummary, frames: bool = False, constraints: bo
     sections = ["\n".join(lines)]
     if summary.freedoms:
         rows = [(name, unit, *map(format_number, numbers)) for name, unit, *numbers in summary.freedoms]
-        sections.append(format_table(("DoF", *DofSummary._fields[1:]), rows, "<<>>>>"))
+        sections.append(format_table(("DoF", *DofSummary._fields[1:-1], "speed [/s]"), rows, "<<>>>>"))
     if summary.interlocks:
         sections.append("\n".join(["interlocks", *(f"  {interlock}" for interlock in summary.interlocks)]))
     locking = {name for interlock in summary.interlocks for name in interlock.constraints}
@@ -115,7 +114,8 @@ def format_sections(summary: ModelSummary, frames: bool = False, constraints: bo
         title = "constraint" if constraints else "other constraints"
         sections.append(format_table((title, ""), [(c.name, c.text) for c in shown]))
     if frames:
-        sections.append("frames\n" + "\n".join(_format_tree(summary.frames)))
+        tree = order_depth_first(summary.frames)
+        sections.append("frames\n" + "\n".join("  " * (depth + 1) + name for name, depth in tree))
     hidden = [] if frames else ["--frames"]
     if not constraints and len(shown) < len(summary.constraints):
         hidden.append("--constraints")
@@ -164,19 +164,6 @@ def _format_contacts(pairs: Sequence[DistanceResult]) -> str:
     if len(pairs) == 1:
         return f"  1 pair of bodies touches at the default state: {deepest}"
     return f"  {len(pairs)} pairs of bodies touch at the default state, first {deepest}"
-
-
-def _format_tree(frames: dict[str, str]) -> list[str]:
-    """Return the frames in depth-first order, each indented by two spaces more than its parent."""
-    children: dict[str, list[str]] = {}
-    for name, parent in frames.items():
-        children.setdefault(parent, []).append(name)
-    lines, stack = [], [(name, 1) for name in reversed(children.get("world", []))]
-    while stack:
-        name, depth = stack.pop()
-        lines.append("  " * depth + name)
-        stack.extend((child, depth + 1) for child in reversed(children.get(name, [])))
-    return lines
 
 
 def is_gallery_list(model: str) -> bool:
@@ -231,17 +218,6 @@ def find_penetrations(model: ModelView) -> Iterator[ModelProblem]:
             yield ModelProblem("contact", pair.a, text)
 
 
-class DofSummary(NamedTuple):
-    """Degree of freedom: limits and default value [unit], and largest speed [unit/s]."""
-
-    name: str
-    unit: str
-    lower: float
-    upper: float
-    default: float
-    speed: float
-
-
 class ConstraintSummary(NamedTuple):
     """Constraint as text; ``simple`` is True if it bounds a single symbol by numbers."""
 
@@ -257,7 +233,7 @@ class ModelSummary:
 
     name: str  # name or path of the model, as given
     frames: dict[str, str]  # parents of the frames, by name
-    freedoms: list[DofSummary]  # degrees of freedom
+    freedoms: list[DofSummary]
     constraints: list[ConstraintSummary]
     low: list[float]  # bounding box of all shapes at the default state [m]
     high: list[float]
@@ -288,15 +264,11 @@ def summarize_model(name: str, model: ModelView) -> ModelSummary:
     ]
     corners = np.concatenate(placed or [np.array([pose[:3, 3] for pose in pose_of.values()])])
     low, high = corners.min(axis=0), corners.max(axis=0)
-    unit = infer_units(model, values, map(str, model.degrees_of_freedom))
     masses = (body.inertia.mass for body in model.bodies.values() if body.inertia is not None)
     return ModelSummary(
         name=name,
         frames={frame: model.frames[frame].parent for frame in model.frames},
-        freedoms=[
-            _summarize_dof(model, symbol, unit[str(symbol)], values[str(symbol)])
-            for symbol in model.degrees_of_freedom
-        ],
+        freedoms=summarize_freedoms(model),
         constraints=[_summarize_constraint(key, constraint) for key, constraint in model.constraints.items()],
         low=low.tolist(),
         high=high.tolist(),
@@ -310,12 +282,6 @@ def summarize_model(name: str, model: ModelView) -> ModelSummary:
         contacts=find_contacts(model),
         sha256=formats.document.document_hash(model) if name.endswith(DOCUMENT_SUFFIXES) else "",
     )
-
-
-def _summarize_dof(model: ModelView, symbol: Symbol, unit: str, default: float) -> DofSummary:
-    lower, upper = model.limits(symbol)
-    slowest, fastest = model.limits(symbol.derivative())
-    return DofSummary(str(symbol), unit, lower, upper, default, max(abs(slowest), abs(fastest)))
 
 
 def _summarize_constraint(name: str, constraint: Constraint) -> ConstraintSummary:

@@ -119,7 +119,8 @@ def load(
         Arguments of a ``.xacro`` template by name. They may also follow the path, ``"arm.xacro side:=left"``.
     frames, symbols, bodies
         Part of a live model: what the poses of these frames and the constraints and rates of these symbols
-        depend on, and whether with bodies. By default all of it.
+        depend on, and whether with bodies. ``kitchen/*`` stands for all frames with names that begin so. By
+        default all of it.
 
     Raises
     ------
@@ -127,6 +128,16 @@ def load(
         If the file is invalid, with file, line, element and reason; or for an invalid prefix or root.
     InvalidValueError
         If ``loops`` is none of these; or for a part of a file, or options of a file for a live model.
+
+    Examples
+    --------
+    >>> kitchen = kv.load("kitchen")
+    >>> kitchen
+    <Model: 54 frames, 23 DoF, 46 constraints (version 1)>
+    >>> kitchen.fk("kitchen/fridge_door_handle")({"kitchen/fridge_door": 0.5})[:3, 3].round(3)
+    array([ 0.842, -1.403,  1.184])
+    >>> kv.load("kitchen", prefix="left").frames["left/fridge_door"].parent
+    'left/fridge'
     """
     check_prefix(prefix)
     check_loops(loops)

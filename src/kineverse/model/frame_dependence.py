@@ -11,7 +11,7 @@ from kineverse.symbols import Symbol
 
 from .body import is_empty_body
 from .frame import WORLD, Frame
-from .model_view import ModelView
+from .model_view import ModelView, find_symbols
 from .rates import collect_symbols
 
 
@@ -26,7 +26,7 @@ class FrameDependence:
     def __init__(self, model: ModelView, symbols: Iterable[Symbol | str]) -> None:
         self._frames: Mapping[str, Frame] = dict(model.frames)
         known = _known_paths(model)
-        asked = (s if isinstance(s, Symbol) else model.symbol(s) for s in symbols)
+        asked = find_symbols(model, symbols)
         self._paths = _driven_coordinates(model, {_known_path(s, known) for s in asked})
         self._moving_ancestors: dict[str, tuple[str, ...]] = {WORLD: ()}
 
@@ -60,9 +60,14 @@ def moved_frames(model: ModelView, symbols: Iterable[Symbol | str]) -> dict[Symb
     Parameters
     ----------
     symbols
-        Symbols or their names, such as the speeds of a controller.
+        Symbols, their names or patterns, such as the speeds of a controller.
+
+    Examples
+    --------
+    >>> kv.model.moved_frames(kv.load("kitchen"), ["kitchen/fridge_door"])
+    {kitchen/fridge_door: ('kitchen/fridge_door', 'kitchen/fridge_door_handle')}
     """
-    asked = [s if isinstance(s, Symbol) else model.symbol(s) for s in symbols]
+    asked = list(find_symbols(model, symbols))
     known = _known_paths(model)
     bits: dict[str, int] = {}  # one bit for each symbol, in the masks of coordinates and of frames
     for i, symbol in enumerate(asked):
@@ -91,7 +96,7 @@ def moving_symbols(model: ModelView, symbols: Iterable[Symbol | str]) -> dict[st
 
     The symbols are compared as in :class:`FrameDependence`. The frames are in the order of the model.
     """
-    asked = [s if isinstance(s, Symbol) else model.symbol(s) for s in symbols]
+    asked = list(find_symbols(model, symbols))
     known = _known_paths(model)
     movers: dict[str, list[Symbol]] = {}
     for symbol in asked:
@@ -106,7 +111,14 @@ def moving_symbols(model: ModelView, symbols: Iterable[Symbol | str]) -> dict[st
 
 
 def count_moved_bodies(model: ModelView, symbols: Iterable[Symbol | str]) -> dict[Symbol, int]:
-    """Return the number of bodies with shapes or inertia that each symbol moves, see :func:`moved_frames`."""
+    """Return the number of bodies with shapes or inertia that each symbol moves, see :func:`moved_frames`.
+
+    Examples
+    --------
+    >>> model = kv.load("pr2")
+    >>> kv.model.count_moved_bodies(model, ["pr2/torso_lift_joint", "pr2/l_wrist_roll_joint"])
+    {pr2/torso_lift_joint: 33, pr2/l_wrist_roll_joint: 7}
+    """
     bodies = {name for name, body in model.bodies.items() if not is_empty_body(body)}
     return {s: len(bodies.intersection(frames)) for s, frames in moved_frames(model, symbols).items()}
 

@@ -11,13 +11,13 @@ import numpy as np
 import numpy.typing as npt
 
 from kineverse._checks import as_tolerance
+from kineverse._rich_display import html_table
 from kineverse.compilation.function import WantedTier, compile_columns, insert_values
 from kineverse.errors import UnknownNameError
 from kineverse.expressions.expression import Expression, as_expression
 from kineverse.expressions.graph import lower
 from kineverse.expressions.implicit import implicit_nodes
 from kineverse.expressions.layout import SX
-from kineverse.expressions.printing import html_table
 from kineverse.state import State, StateLike, as_state
 from kineverse.symbols import Symbol
 
@@ -25,7 +25,12 @@ from .constraint import Constraint
 
 
 class Violation(NamedTuple):
-    """Violated constraint: value, bounds at the configuration, and excess."""
+    """Violated constraint: value, bounds at the configuration, and excess.
+
+    See Also
+    --------
+    kineverse.Model.violations
+    """
 
     name: str
     value: float
@@ -35,7 +40,12 @@ class Violation(NamedTuple):
 
 
 class Violations(tuple[Violation, ...]):
-    """Violated constraints, largest excess first, with the names of unchecked ones."""
+    """Violated constraints, largest excess first, with the names of unchecked ones.
+
+    See Also
+    --------
+    kineverse.Model.violations
+    """
 
     unchecked: tuple[str, ...]
 
@@ -90,6 +100,16 @@ class ConstraintChecker:
     excess
         The larger of ``lower - values`` and ``values - upper``, shape (m,): positive if the constraint is
         violated, NaN if value or bounds are.
+
+    Examples
+    --------
+    >>> model = kv.load("kitchen")
+    >>> check = model.constraint_checker(model.degrees_of_freedom)
+    >>> x = np.zeros(len(check.symbols))
+    >>> x[0] = -0.1
+    >>> check.violations(x)
+    1 violated
+      kitchen/dishwasher_door/position: 0 <= -0.1 <= 1.5708 is off by 0.1
     """
 
     symbols: tuple[Symbol, ...]

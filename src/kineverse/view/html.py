@@ -1,35 +1,12 @@
-"""HTML of the page.
-
-Elements with escaped text, the only place in which names and messages become HTML, and reports of violated
-constraints and failures.
-"""
+"""HTML of the page: exchangeable boxes, and reports of violated constraints and failures."""
 
 from __future__ import annotations
 
-import html
 from collections.abc import Iterable, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any
 
-
-class Html(str):
-    """Text that is HTML already."""
-
-    __slots__ = ()
-
-
-def element(tag: str, *content: str, style: str = "", **attributes: object) -> Html:
-    """Return an HTML element; its content is escaped, unless it is :class:`Html`."""
-    named = {name.rstrip("_").replace("_", "-"): value for name, value in attributes.items()}
-    shown = {**({"style": style} if style else {}), **named}
-    opened = "".join(f' {name}="{html.escape(str(value))}"' for name, value in shown.items())
-    inside = "".join(text if isinstance(text, Html) else html.escape(text) for text in content)
-    return Html(f"<{tag}{opened}>{inside}</{tag}>")
-
-
-def join_html(*content: str) -> Html:
-    """Concatenate content; text that is not :class:`Html` is escaped."""
-    return Html("".join(text if isinstance(text, Html) else html.escape(text) for text in content))
+from kineverse._rich_display import Html, element
 
 
 class HtmlBox:

@@ -7,8 +7,10 @@ import threading
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
+from kineverse._rich_display import Html, element
+
 from .animation import VelocityDrive
-from .html import Html, HtmlBox, element, format_missing_meshes, format_significant, format_violations
+from .html import HtmlBox, format_missing_meshes, format_significant, format_violations
 from .proximity_panel import ProximityPanel
 from .scene import ViewerScene
 from .sliders import QuaternionAngles, Ranges, choose_slider_range, choose_slider_step, on_input

@@ -9,8 +9,10 @@ import time
 from collections.abc import Iterable, Mapping
 from typing import Any
 
+from kineverse._rich_display import Html
 from kineverse.errors import InvalidValueError, KineverseError, UnknownNameError, suggest
 from kineverse.model.constraint import Constraint
+from kineverse.model.kinematics import infer_units
 from kineverse.model.model import Model
 from kineverse.model.model_view import ModelView
 from kineverse.planning.trajectories.trajectory import Trajectory
@@ -20,19 +22,19 @@ from . import server as web
 from .animation import PlaybackLayer, RangeAnimation, TrajectoryPlayback, VelocityDrive, select_animated
 from .camera import Camera
 from .drawables import Drawable
-from .html import Html, element, format_failure, format_violations
+from .html import format_failure, format_violations
+from .notebook import bundle_display, is_in_notebook
 from .page import choose_title
 from .panel import Panel
 from .poses import complete, keep_known
 from .proximity_panel import ProximityPanel
 from .scene import ViewerScene
-from .sliders import QuaternionAngles, Ranges, infer_units
+from .sliders import QuaternionAngles, Ranges
 from .triangle_mesh import Floats
 
 logger = logging.getLogger(__name__)
 
 PERIOD = 1.0 / 30.0  # least time between two updates of the page [s]; requests in between are drawn together
-EMBEDDED_HEIGHT = 600  # height of the page in a notebook [pixels]
 PANEL_WIDTH = 380  # width of the controls: room for the names of joints [pixels]
 
 
@@ -71,7 +73,9 @@ class Viewer:
         self._animation: RangeAnimation | TrajectoryPlayback | None = None
         self._playback: TrajectoryPlayback | None = None
         self._drawn = 0.0
-        self._server = web.start(port, label or choose_title(model), host)
+        self._camera = camera
+        # A saved notebook must not show whatever has its port later.
+        self._server = web.start(port, label or choose_title(model), host, secret=is_in_notebook())
         try:
             self._server.gui.configure_theme(
                 show_logo=False, show_share_button=False, brand_color=(34, 104, 172)
@@ -265,12 +269,12 @@ class Viewer:
     def __repr__(self) -> str:
         return f"<page of {self.model!r}, {'taken down' if self._stopping else self.address}>"
 
-    def _repr_html_(self) -> str:
-        if self._stopping:
-            return str(element("i", "This page has been taken down."))
-        return str(
-            element("iframe", src=self.address, width="100%", height=EMBEDDED_HEIGHT, style="border:none")
-        )
+    def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> dict[str, Any]:
+        model = _freeze(self.model)
+        values = complete(model, keep_known(model, self.values))
+        address = "" if self._stopping else self.address
+        note = "This page has been taken down." if self._stopping else ""
+        return bundle_display(repr(self), model, values, self._camera, address=address, note=note)
 
     def __enter__(self) -> Viewer:
         return self

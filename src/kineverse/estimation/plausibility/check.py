@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from kineverse._names import match_names
 from kineverse.errors import InvalidValueError, KineverseError, ShapeError, UnknownNameError, suggest
 from kineverse.estimation.correlation import CorrelationSettings, ErrorCorrelation
 from kineverse.estimation.identification import native
@@ -97,6 +98,16 @@ def check_plausibility(
         For invalid poses, covariances or times, and if a covariance is missing.
     ImplausibleError
         If ``strict``, and a joint does not explain the observations.
+
+    Examples
+    --------
+    >>> model = kv.load("shelf_door")
+    >>> slide = np.stack([kv.translation(0, 0.02 * k, 0)() for k in range(30)])  # it is a drawer
+    >>> report = kv.estimation.check_plausibility(model, {"shelf_door/door": slide}, noise=(0.002, 0.01))
+    >>> [verdict.tag for verdict in report.implausible]
+    ['joint shelf_door/door']
+    >>> report.repair(model)
+    ('joint shelf_door/door',)
     """
     checked: object = model.model if isinstance(model, Tracker) else model
     checked = checked.model() if isinstance(checked, Snapshot) else checked
@@ -256,11 +267,21 @@ class PlausibilityMonitor:
     Parameters
     ----------
     frames
-        Names of the frames that may be observed.
+        Names of the frames that may be observed, or patterns.
     noise, relative_to, families, false_alarms, outliers, decorrelation_time, repaired
         As in :func:`~kineverse.estimation.check_plausibility`.
     keep
         Number of recent observations that reports use.
+
+    Examples
+    --------
+    >>> model = kv.load("shelf_door")
+    >>> monitor = kv.estimation.PlausibilityMonitor(model, ["shelf_door/door"], noise=(0.002, 0.01))
+    >>> door = model.fk("shelf_door/door")
+    >>> for q in np.linspace(0, 1, 10):
+    ...     rejected = monitor.update({"shelf_door/door": door({"shelf_door/door": q})})
+    >>> rejected
+    ()
     """
 
     def __init__(
@@ -278,7 +299,7 @@ class PlausibilityMonitor:
         keep: int = 500,
     ) -> None:
         self.model = model
-        self.frames = tuple(dict.fromkeys(frames))
+        self.frames = match_names(frames, [*model.frames, WORLD], "frame", "frames=")
         self.count, self.false_alarms = 0, false_alarms
         correlation = CorrelationSettings(decorrelation_time, False)
         self._settings = TestSettings(false_alarms, as_outliers(outliers), relative_to, families, correlation)

@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
+from kineverse._names import match_names
 from kineverse.errors import ModelError, UnknownNameError, suggest
 from kineverse.estimation.identification.result import SURE, IdentificationResult
 from kineverse.expressions.expression import Expression
@@ -37,11 +38,10 @@ class TestableJoints:
 
 def find_testable_joints(model: Model, observed: Iterable[str], relative_to: str | None) -> TestableJoints:
     """Find the joints that observed frames can test."""
-    names = list(dict.fromkeys(observed))
-    for name in names if relative_to is None else [*names, relative_to]:
-        if name != WORLD and name not in model.frames:
-            hint = suggest(name, [*model.frames, WORLD], "frame")
-            raise UnknownNameError(f"There is no frame {name!r}. {hint}")
+    known = [*model.frames, WORLD]
+    names = list(match_names(observed, known, "frame"))
+    if relative_to is not None:
+        match_names(relative_to, known, "frame", "relative_to=")
 
     def chain(name: str) -> list[str]:
         return [*ancestors(name, model.frames.__getitem__), WORLD]
@@ -94,12 +94,22 @@ def find_testable_joints(model: Model, observed: Iterable[str], relative_to: str
 
 
 class ImplausibleError(ModelError):
-    """Joints of a model do not explain the observations."""
+    """Joints of a model do not explain the observations.
+
+    See Also
+    --------
+    kineverse.estimation.check_plausibility
+    """
 
 
 @dataclass(frozen=True)
 class JointVerdict:
-    """Verdict on one joint."""
+    """Verdict on one joint.
+
+    See Also
+    --------
+    kineverse.estimation.check_plausibility
+    """
 
     joint: TestableJoint
     # Of the joint as "served", the same displaced ("elsewhere"), a "rigid" connection, a "free" child, and
@@ -147,7 +157,12 @@ class JointVerdict:
 
 @dataclass(frozen=True)
 class Plausibility:
-    """Verdicts on all testable joints."""
+    """Verdicts on all testable joints.
+
+    See Also
+    --------
+    kineverse.estimation.check_plausibility
+    """
 
     verdicts: tuple[JointVerdict, ...]  # for each pair of frames; a second frame of a part is another pair
     untested: Mapping[str, str]  # observed frames that test no single operation, with the reason in words

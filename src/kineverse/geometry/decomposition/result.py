@@ -40,6 +40,12 @@ class DecompositionSettings:
     ------
     InvalidValueError
         If one of them is not positive.
+
+    Examples
+    --------
+    >>> settings = kv.geometry.decomposition.DecompositionSettings(max_hulls=8)
+    >>> settings.max_error(0.5)  # of a mesh 0.5 m long: 2 %
+    0.01
     """
 
     error: float | None = None
@@ -83,6 +89,10 @@ class Decomposition:
         Time of creation, in seconds since 1970.
     remarks
         Defects of the mesh.
+
+    See Also
+    --------
+    kineverse.geometry.decomposition.decompose
     """
 
     hulls: tuple[Floats, ...]
@@ -136,7 +146,12 @@ DECOMPOSITIONS = KINDS["decompositions"].make_cache(
 
 @dataclass(frozen=True, slots=True)
 class CacheEntry:
-    """Cached decomposition, and the size of its file [bytes]."""
+    """Cached decomposition, and the size of its file [bytes].
+
+    See Also
+    --------
+    kineverse.geometry.decomposition.list_entries
+    """
 
     decomposition: Decomposition
     bytes: int
@@ -157,18 +172,34 @@ def add_entry(mesh: str, settings: str, decomposition: Decomposition) -> None:
 
 
 def list_entries() -> list[CacheEntry]:
-    """Return all entries of the cache, sorted by the name of the mesh file."""
+    """Return all entries of the cache, sorted by the name of the mesh file.
+
+    See Also
+    --------
+    kineverse.geometry.decomposition.decompose
+    """
     kept = [CacheEntry(*entry) for entry in DECOMPOSITIONS.read_all(Decomposition.from_bytes)]
     return sorted(kept, key=lambda one: (one.decomposition.name, one.decomposition.made))
 
 
 def clear() -> int:
-    """Remove all entries, and return their number."""
+    """Remove all entries, and return their number.
+
+    See Also
+    --------
+    kineverse.geometry.decomposition.decompose
+    """
     return DECOMPOSITIONS.clear()
 
 
 def folder() -> Path:
-    """Return the path of the cache folder."""
+    """Return the path of the cache folder.
+
+    Examples
+    --------
+    >>> kv.geometry.decomposition.folder().name
+    'decompositions'
+    """
     return DECOMPOSITIONS.folder.path
 
 
