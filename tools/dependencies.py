@@ -86,7 +86,7 @@ def make_table() -> str:
 
 
 def find_with_wheels(extras: Sequence[str], platform: str, python: str) -> set[str]:
-    """Return the extras of which the newest versions that fit each other have wheels, with all that they need.
+    """Return the extras whose newest versions that fit each other have wheels, with all that they need.
 
     Extras that can be installed together can be installed alone.
     """

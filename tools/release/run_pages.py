@@ -1,7 +1,7 @@
 """Run the Python of pages in this environment, and compare what it prints: ``run_pages.py PAGE ...``.
 
-A folder stands for its pages.
-A page may stop where an extra is missing, if it names this extra. With ``--whole`` it may not.
+A folder stands for its pages. A page may stop where an extra is missing, if it names this extra. With
+``--whole`` it may not.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ from importlib.util import find_spec
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
-sys.path.append(str(ROOT / "tests"))
+sys.path += [str(ROOT / "tests"), str(ROOT / "examples")]  # as the tests of the pages have it
 
 import markdown_examples  # noqa: E402  - of the tests
 
-BESIDE = {"kineverse_studies": "studies", "living_kitchen": "living_kitchen"}
-"""What pages import that is in no extra, and the word by which they name it."""
+BESIDE = {"kineverse_studies": "studies"}
+"""The packages that are in no extra, and the words by which pages name them."""
 
 
 def main(words: list[str]) -> int:
@@ -49,7 +49,7 @@ def run(page: Path, whole: bool) -> str | None:
             named = [
                 name
                 for name in missing
-                if re.search(rf"extras?\b[^.|]*`{name}`|\b{name}\b(?=\))|\[{name}\]", text)
+                if re.search(rf"extras?\b[^.|]*`{name}`|\b{name}\b(?=\))|\[[\w,]*\b{name}\b[\w,]*\]", text)
             ]
             beside = BESIDE.get(error.name or "")
             if whole or not (named or (beside and beside in text)):

@@ -18,6 +18,12 @@ from types import MappingProxyType
 
 from build_distributions import Archives
 
+PAGES_OF_THE_CORE = (
+    *("models", "editing", "expressions", "gradients", "articulations", "mechanisms", "interlocks"),
+    *("evaluation", "documents", "files", "identification", "calibration"),
+)
+"""The pages that run to their ends without an extra."""
+
 PICTURE = b"\x89PNG"
 
 
@@ -62,6 +68,7 @@ def try_core(environment: Environment) -> None:
     """Run what needs no extra; what needs one has to name it."""
     environment.command("--help")
     environment.pages("README.md", "CONTRIBUTING.md", "docs")
+    environment.pages(*(f"docs/{name}.md" for name in PAGES_OF_THE_CORE), "--whole")
     for name in _examples_of_the_core(environment.source):
         environment.run("python", f"examples/{name}", "--headless")
     for line in (
@@ -80,7 +87,9 @@ def try_core(environment: Environment) -> None:
         environment.command(line)
     environment.command("diff examples/door.urdf examples/door_new.urdf", status=(1,))
     assert (environment.source / "kitchen.png").read_bytes().startswith(PICTURE), "kitchen.png is no picture"
-    environment.run("python", "tools/release/run_pages.py", "README.md", path=str(environment.folder / "bin"))
+    environment.run(
+        "python", "tools/release/run_pages.py", "docs/models.md", path=str(environment.folder / "bin")
+    )
     commands = environment.run(
         "python", "-c", "from kineverse.cli.command_line import *; print(*COMMANDS, *BESIDE)"
     ).stdout.split()
