@@ -49,7 +49,7 @@ def run(page: Path, whole: bool) -> str | None:
             named = [
                 name
                 for name in missing
-                if re.search(rf"extras?\b[^.|]*`{name}`|\b{name}\b(?=\))|\[[\w,]*\b{name}\b[\w,]*\]", text)
+                if re.search(rf"extras?\b[^.|]*`{name}`|\[[\w,]*\b{name}\b[\w,]*\]", text)
             ]
             beside = BESIDE.get(error.name or "")
             if whole or not (named or (beside and beside in text)):
