@@ -60,7 +60,7 @@ def test_move_and_reset(page):
 def test_angles_are_shown_in_degrees_on_demand_also_after_edits(page):
     page.move({"cabinet/door": 0.5, "cabinet/drawer": 0.1})
     assert page.settled()
-    page._panel._convert(True)
+    page._panel._convert(degrees=True)
     door = pytest.approx(np.degrees(0.5))
     assert sliders(page)["cabinet/door"] == ("door [°]   0 to 85.94", 0.0, np.degrees(1.5), door)
     assert sliders(page)["cabinet/drawer"] == ("drawer [m]   0 to 0.4", 0.0, 0.4, 0.1)
@@ -72,9 +72,9 @@ def test_angles_are_shown_in_degrees_on_demand_also_after_edits(page):
     with page.model.edit() as edit:
         edit.constrain("cabinet/knob/range", -1, kv.position("cabinet/knob"), 0.0123)
     assert page.settled()
-    assert sliders(page)["cabinet/knob"][0] == "knob [°]   −57.3 to 0.7"
-    page._panel._convert(False)
-    assert sliders(page)["cabinet/knob"][:3] == ("knob [rad]   −1 to 0.012", -1.0, 0.0123)
+    assert sliders(page)["cabinet/knob"][0] == "knob [°]   −57.3 to 0.7047"
+    page._panel._convert(degrees=False)
+    assert sliders(page)["cabinet/knob"][:3] == ("knob [rad]   −1 to 0.0123", -1.0, 0.0123)
     assert page.values["cabinet/door"] == 2.0
 
 
