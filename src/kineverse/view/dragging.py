@@ -114,7 +114,7 @@ class DragSolver:
         for _ in range(_STEPS):
             speeds = controller.step(state).speeds
             state = self._model.integrate(state, speeds, _DT)
-            final = _DT * max(map(abs, speeds.values())) < _SETTLED
+            final = _DT * max(map(abs, speeds.values()), default=0.0) < _SETTLED
             if final:
                 break
         return {s: float(state[s]) for s in values if state[s] != before[s]}, final
