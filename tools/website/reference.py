@@ -23,7 +23,21 @@ from website.pages import find_documents
 from website.uses import find_users
 
 BASES = ", ".join(
-    "object ABC Protocol Generic Mapping Sequence Struct Enum BaseException tuple dict str int".split()
+    (
+        "object",
+        "ABC",
+        "Protocol",
+        "Generic",
+        "Mapping",
+        "Sequence",
+        "Struct",
+        "Enum",
+        "BaseException",
+        "tuple",
+        "dict",
+        "str",
+        "int",
+    )
 )
 """Classes of other people: what a class of ours has from them stands in their own documentation."""
 
