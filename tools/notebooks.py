@@ -70,7 +70,12 @@ def run_notebook(notebook: Any, kernel: KernelManager) -> Any:
     new = nbformat.v4.new_notebook(cells=[reset, *(nbformat.from_dict(dict(c)) for c in notebook.cells)])
     with tempfile.TemporaryDirectory() as folder:
         reset.source = f"import os\nos.chdir({folder!r})\n%reset -f"
-        NotebookClient(new, km=kernel, timeout=TIMEOUT, record_timing=False).execute()
+        client = NotebookClient(new, km=kernel, timeout=TIMEOUT, record_timing=False)
+        try:
+            client.execute()
+        finally:
+            if client.kc is not None:
+                client.kc.stop_channels()
     new.cells = new.cells[1:]
     new.metadata = nbformat.from_dict(METADATA)
     count = 0
