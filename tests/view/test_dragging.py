@@ -317,9 +317,10 @@ def test_without_degrees_of_freedom_nothing_can_be_dragged():
             edit.add_frame("lid", parent="block", transform=kv.rotation_x(kv.position("lid")))
         assert page.settled()
         assert page._drag._controls[0].options == ("–", "lid")
+        page._drag.choose("lid")
         page.hide_sliders()
         assert page.settled()
-        assert page._drag._controls is None
+        assert page._drag._controls is page._drag._gizmo is None
 
 
 def test_without_the_solver_a_line_names_the_extra(monkeypatch):

@@ -59,7 +59,7 @@ def test_show_in_a_script_waits_until_ctrl_c(monkeypatch, capfd, opened):
 def test_show_without_block_returns_at_once(capfd, opened):
     with kv.show(cabinet(), port=0, block=False, open_browser=False, degrees=True) as page:
         assert page.settled()
-        assert page._panel.degrees
+        assert page._display.degrees
         assert capfd.readouterr().err == f"{page.address}   (page.stop() ends)\n"
         assert repr(page) == f"<page of {page.model!r}, {page.address}>"
     assert opened == []

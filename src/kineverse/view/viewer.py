@@ -130,6 +130,7 @@ class Viewer:
     def hide_sliders(self) -> None:
         """Show neither sliders nor the report of constraints: something else moves the model."""
         self._is_driven = True
+        self._drag.choose(None)
         self.refresh()
 
     def show_overlay(self, items: Iterable[Drawable]) -> None:
