@@ -31,7 +31,7 @@ class DistanceResult:
 
     See Also
     --------
-    kineverse.geometry.Scene.distance
+    kineverse.geometry.Scene
     """
 
     a: str

@@ -155,7 +155,7 @@ class CacheEntry:
 
     See Also
     --------
-    kineverse.geometry.decomposition.list_entries
+    kineverse.geometry.decomposition.decompose
     """
 
     decomposition: Decomposition
