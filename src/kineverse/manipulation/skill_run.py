@@ -49,7 +49,7 @@ class SkillRun:
 
     Examples
     --------
-    >>> from kineverse.manipulation import SkillError, SkillRun
+    >>> from kineverse.manipulation import SkillRun
     >>> world = kv.worlds.KinematicWorld(kv.load("fetch"), "fetch")
     >>> session = kv.manipulation.Session(world, belief=kv.worlds.TrueBelief(world))
     >>> run = SkillRun(session, kv.position("fetch/torso_lift_joint"), seconds=5)

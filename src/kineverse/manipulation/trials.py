@@ -50,6 +50,10 @@ def judge_outcome(outcome: Outcome, metrics: RunMetrics) -> JudgedOutcome:
     metrics
         Metrics of the run, with the coordinate of the object. Their measures are added, and the ``way`` and
         the ``turn`` of a part replace what the skill believes of them.
+
+    See Also
+    --------
+    kineverse.manipulation.open_object
     """
     value, overlap, objections = metrics.value, metrics.overlap, list[str]()
     measures = {**metrics.measures, **outcome.measures}

@@ -47,7 +47,7 @@ class Mode:
 
     See Also
     --------
-    kineverse.planning.Planner.plan
+    kineverse.planning.Planner
     """
 
     name: str

@@ -150,7 +150,7 @@ class CacheEntry:
 
     See Also
     --------
-    kineverse.geometry.decomposition.list_entries
+    kineverse.geometry.decomposition.decompose
     """
 
     decomposition: Decomposition

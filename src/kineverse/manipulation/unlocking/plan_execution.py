@@ -244,6 +244,14 @@ def execute_unlocking(
     ------
     UnknownNameError, InvalidValueError
         As :func:`kineverse.reasoning.plan_unlocking`; also for times and speeds that are not positive.
+
+    Examples
+    --------
+    >>> model = kv.load("articulations/garage_door")
+    >>> session = kv.manipulation.Session(kv.worlds.MechanismWorld(model), dt=0.05)
+    >>> result = kv.manipulation.execute_unlocking(session, {"garage_door/garage/door": 1.0})
+    >>> result.done, len(result.moves)
+    (True, 2)
     """
     mover = PartMover(model or session.model, session, patience=patience, speed=speed)
     return _Execution(mover, goal, fixed, budget).run()
