@@ -36,7 +36,16 @@ __all__ = [
 
 
 class KineverseError(Exception):
-    """Base of all errors of this package."""
+    """Base of all errors of this package.
+
+    Examples
+    --------
+    >>> try:
+    ...     kv.load("kitchn")
+    ... except kv.KineverseError as error:
+    ...     print(str(error).splitlines()[0])
+    There is no model 'kitchn'. Did you mean 'kitchen'?...
+    """
 
     def __str__(self) -> str:
         # KeyError prints the repr of its argument; the message is printed as it is.
@@ -59,35 +68,101 @@ class UnknownNameError(KineverseError, KeyError):
     """A frame, symbol, constraint, tag or model of that name does not exist.
 
     Everything that takes a name raises it, and lists similar names.
+
+    Examples
+    --------
+    >>> kv.load("kitchen").fk("kitchen/fridge_dor")
+    Traceback (most recent call last):
+        ...
+    kineverse.errors.UnknownNameError: There is no frame 'kitchen/fridge_dor'. Did you mean ...
     """
 
 
 class DuplicateNameError(KineverseError, ValueError):
-    """A name, tag or constraint is in use already: of a frame or articulation for each new one."""
+    """A name, tag or constraint is in use already: of a frame or articulation for each new one.
+
+    Examples
+    --------
+    >>> model = kv.load("kitchen")
+    >>> with model.edit() as edit:
+    ...     edit.add_frame("kitchen/fridge_door", parent="world")
+    Traceback (most recent call last):
+        ...
+    kineverse.errors.DuplicateNameError: There is a frame 'kitchen/fridge_door' already, written by ...
+    """
 
 
 class ShapeError(KineverseError, ValueError):
-    """Operands, arrays or matrices have incompatible shapes."""
+    """Operands, arrays or matrices have incompatible shapes.
+
+    Examples
+    --------
+    >>> kv.array([1, 2, 3]) + kv.array([kv.position("x"), 2])
+    Traceback (most recent call last):
+        ...
+    kineverse.errors.ShapeError: Shapes (3,) and (2,) cannot be broadcast together.
+    """
 
 
 class InvalidValueError(KineverseError, ValueError):
-    """A value is outside of its domain: NaN, an empty range, an axis of length zero ..."""
+    """A value is outside of its domain: NaN, an empty range, an axis of length zero ...
+
+    Examples
+    --------
+    >>> kv.axis_angle((0, 0, 0), 1.0)
+    Traceback (most recent call last):
+        ...
+    kineverse.errors.InvalidValueError: The axis of a rotation has length zero.
+    """
 
 
 class ExpressionError(KineverseError, TypeError):
-    """An expression is used in a way that is not defined (such as ``if expression:``)."""
+    """An expression is used in a way that is not defined (such as ``if expression:``).
+
+    Examples
+    --------
+    >>> bool(kv.position("x") < 1)
+    Traceback (most recent call last):
+        ...
+    kineverse.errors.ExpressionError: An expression has no truth value. Write (0.4 < b) & (b < 0.6) ...
+    """
 
 
 class CompileError(KineverseError, RuntimeError):
-    """Expressions cannot be compiled to a function."""
+    """Expressions cannot be compiled to a function.
+
+    Examples
+    --------
+    >>> kv.compile([])
+    Traceback (most recent call last):
+        ...
+    kineverse.errors.CompileError: There is no output to compile.
+    """
 
 
 class NoSolutionError(KineverseError, ValueError):
-    """A closed loop, or another implicit function, has no solution at the values given."""
+    """A closed loop, or another implicit function, has no solution at the values given.
+
+    See Also
+    --------
+    kineverse.loops.solve_loop
+    kineverse.CloseLoop
+    """
 
 
 class ModelError(KineverseError, ValueError):
-    """A model would be inconsistent: cyclic frames, cyclic rates, rates by undefined symbols."""
+    """A model would be inconsistent: cyclic frames, cyclic rates, rates by undefined symbols.
+
+    Examples
+    --------
+    >>> model = kv.Model()
+    >>> with model.edit() as edit:
+    ...     edit.add_frame("a", parent="world")
+    ...     edit.attach("a", parent="a", transform=np.eye(4))
+    Traceback (most recent call last):
+        ...
+    kineverse.errors.ModelError: Cyclic frames: 'a' would be its own parent.
+    """
 
 
 class EditError(KineverseError, RuntimeError):
@@ -97,6 +172,15 @@ class EditError(KineverseError, RuntimeError):
     ----------
     failures
         The errors of operations that cannot be applied, by tag.
+
+    Examples
+    --------
+    >>> model = kv.load("kitchen")
+    >>> with model.edit() as edit:
+    ...     edit.remove("joint kitchen/fridge_door")
+    Traceback (most recent call last):
+        ...
+    kineverse.errors.EditError: The edit is refused, because these operations cannot be applied:...
     """
 
     def __init__(self, message: str, failures: Mapping[str, KineverseError] | None = None) -> None:
@@ -113,6 +197,10 @@ class ConflictError(EditError):
         Operations and values in which the two meet.
     revision, who
         Version of the other edit, and who has made it.
+
+    See Also
+    --------
+    kineverse.exchange.LiveModel
     """
 
     def __init__(
@@ -129,27 +217,65 @@ class ConflictError(EditError):
 
 
 class ForbiddenError(EditError):
-    """The right of this user does not allow it, and nothing was done; the message says what it allows."""
+    """The right of this user does not allow it, and nothing was done; the message says what it allows.
+
+    See Also
+    --------
+    kineverse.exchange.serve
+    """
 
 
 class OfflineError(KineverseError, ConnectionError):
-    """The server of a live model does not answer; the model can be read on, and edits are not possible."""
+    """The server of a live model does not answer; the model can be read on, and edits are not possible.
+
+    See Also
+    --------
+    kineverse.exchange.LiveModel
+    """
 
 
 class UnknownAttributeError(KineverseError, AttributeError):
-    """An object has no such attribute; the message lists similar names."""
+    """An object has no such attribute; the message lists similar names.
+
+    Examples
+    --------
+    >>> kv.Model().forward_kinematics
+    Traceback (most recent call last):
+        ...
+    kineverse.errors.UnknownAttributeError: A model has no 'forward_kinematics'. Here that is ...
+    """
 
 
 class FormatError(KineverseError, ValueError):
-    """A file or document does not follow its format."""
+    """A file or document does not follow its format.
+
+    Examples
+    --------
+    >>> with open("door.urdf", "w", encoding="utf-8") as file:
+    ...     size = file.write("<robot name='door'><link>")
+    >>> kv.load("door.urdf")
+    Traceback (most recent call last):
+        ...
+    kineverse.errors.FormatError: door.urdf, line 1, column 26, in <link> of line 1: not well-formed ...
+    """
 
 
 class SimulationError(KineverseError, RuntimeError):
-    """A simulation has come to a state that is not to be trusted; its world has to be reset."""
+    """A simulation has come to a state that is not to be trusted; its world has to be reset.
+
+    See Also
+    --------
+    kineverse.worlds.MujocoWorld
+    """
 
 
 class StoppedError(KineverseError, RuntimeError):
-    """A robot takes no commands until people release it: an emergency stop, or a protective one."""
+    """A robot takes no commands until people release it: an emergency stop, or a protective one.
+
+    See Also
+    --------
+    kineverse.live.WorldProcess
+    """
 
 
 class InfeasibleError(KineverseError, ValueError):
@@ -162,6 +288,11 @@ class InfeasibleError(KineverseError, ValueError):
         ``upper``: without any of them the others can be satisfied.
     command
         The command that violates the rows least, within the limits of single speeds.
+
+    See Also
+    --------
+    kineverse.control.Keep
+    kineverse.control.Controller
     """
 
     def __init__(self, message: str, conflict: Sequence[Any] = (), command: Any = None) -> None:
@@ -177,6 +308,11 @@ class NotFiniteError(KineverseError, ArithmeticError):
     ----------
     names
         The tasks and constraints with such values.
+
+    See Also
+    --------
+    kineverse.Model.violations
+    kineverse.control.Controller
     """
 
     def __init__(self, message: str, names: Sequence[str] = ()) -> None:
@@ -185,7 +321,14 @@ class NotFiniteError(KineverseError, ArithmeticError):
 
 
 class MissingDependencyError(KineverseError, ImportError):
-    """An optional dependency is not installed; the message names the extra that brings it."""
+    """An optional dependency is not installed; the message names the extra that brings it.
+
+    See Also
+    --------
+    kineverse.to_jax
+    kineverse.to_torch
+    kineverse.show
+    """
 
 
 def duplicate_value_error(symbol: object) -> DuplicateNameError:
@@ -229,6 +372,11 @@ def suggest(name: str, available: Iterable[str], what: str = "name", limit: int 
         The noun for the names.
     limit
         The largest number of listed names.
+
+    Examples
+    --------
+    >>> kv.errors.suggest("fridge_dor", ["fridge_door", "oven_door", "sink"])
+    "Did you mean 'fridge_door'?"
     """
     import difflib  # for start-up time
 

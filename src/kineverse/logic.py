@@ -39,6 +39,7 @@ from kineverse.symbols import Symbol
 __all__ = ["CONTRAST", "less", "logic_and", "logic_not", "logic_or"]
 
 CONTRAST = 1e10
+"""Contrast of comparisons by default: they change from 0 to 1 within about 1e-10 around equality."""
 
 
 def less(a: ExpressionLike, b: ExpressionLike, contrast: float = CONTRAST) -> Expression:
@@ -50,6 +51,12 @@ def less(a: ExpressionLike, b: ExpressionLike, contrast: float = CONTRAST) -> Ex
         The operands, compared elementwise.
     contrast
         R, per unit: the value changes within about 1/R around equality.
+
+    Examples
+    --------
+    >>> q = kv.position("q")
+    >>> kv.logic.less(q, 1)({"q": 0.2}), kv.logic.less(q, 1)({"q": 1}), (q < 1)({"q": 3})
+    (np.float64(1.0), np.float64(0.5), np.float64(0.0))
     """
     if not isinstance(contrast, Real) or not 0 < contrast < math.inf:
         raise InvalidValueError(f"The contrast is a positive number, not {contrast!r}.")
@@ -58,18 +65,42 @@ def less(a: ExpressionLike, b: ExpressionLike, contrast: float = CONTRAST) -> Ex
 
 
 def logic_not(a: ExpressionLike) -> Expression:
-    """Return the truth of "not a"; also ``~a``."""
+    """Return the truth of "not a"; also ``~a``.
+
+    Examples
+    --------
+    >>> kv.logic.logic_not(kv.position("q") < 1)({"q": 3})
+    np.float64(1.0)
+    """
     operand = as_expression(a)
     return Not.from_arguments((operand,), operand.shape)
 
 
 def logic_and(*operands: ExpressionLike) -> Expression:
-    """Return the truth of "all of them"; also ``a & b``."""
+    """Return the truth of "all of them"; also ``a & b``.
+
+    Examples
+    --------
+    >>> q = kv.position("q")
+    >>> inside = kv.logic.logic_and(0 < q, q < 1)
+    >>> inside({"q": 0.5}), inside({"q": 2})
+    (np.float64(1.0), np.float64(0.0))
+    """
     return _join(And, operands)
 
 
 def logic_or(*operands: ExpressionLike) -> Expression:
-    """Return the truth of "at least one of them"; also ``a | b``."""
+    """Return the truth of "at least one of them"; also ``a | b``.
+
+    Examples
+    --------
+    >>> bolt, q = kv.position("bolt"), kv.position("door")
+    >>> free = kv.logic.logic_or(bolt > 0.01, q > 0.2)
+    >>> free({"bolt": 0, "door": 0.5})
+    np.float64(1.0)
+    >>> free.gradient()[bolt.derivative()]({"bolt": 0, "door": 0.1})  # drawing the bolt frees the door
+    np.float64(1.0)
+    """
     return _join(Or, operands)
 
 

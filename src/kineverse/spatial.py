@@ -66,6 +66,7 @@ __all__ = [
 ]
 
 Direction = tuple[float, float, float]
+"""A unit vector of numbers."""
 
 X, Y, Z = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
 
@@ -99,6 +100,12 @@ class OneAxisTransform(Expression):
         A scalar, [rad] or [m].
     is_rotation
         True for a rotation, False for a translation.
+
+    Examples
+    --------
+    >>> turn = kv.rotation_z(kv.position("q") / 2)
+    >>> turn.direction, turn.amount, turn.is_rotation
+    ((0.0, 0.0, 1.0), q/2, True)
     """
 
     __slots__ = ("amount", "direction", "is_rotation")
@@ -158,12 +165,24 @@ class OneAxisTransform(Expression):
 
 
 def rotation_about(axis: Direction, angle: ExpressionLike) -> OneAxisTransform:
-    """Return the 4×4 rotation about the coordinate axis X, Y or Z by ``angle`` [rad]."""
+    """Return the 4×4 rotation about the coordinate axis X, Y or Z by ``angle`` [rad].
+
+    Examples
+    --------
+    >>> kv.spatial.rotation_about((0.0, 0.0, 1.0), kv.position("q"))[:2, 0]
+    Expression(2,)[cos(q), sin(q)]
+    """
     return OneAxisTransform(axis, angle, True)
 
 
 def translation_along(direction: Direction, distance: ExpressionLike) -> OneAxisTransform:
-    """Return the 4×4 translation along a constant unit vector by ``distance`` [m]."""
+    """Return the 4×4 translation along a constant unit vector by ``distance`` [m].
+
+    Examples
+    --------
+    >>> kv.spatial.translation_along((0.6, 0.0, 0.8), kv.position("q"))[:3, 3]
+    Expression(3,)[0.6*q, 0, 0.8*q]
+    """
     return OneAxisTransform(direction, distance, False)
 
 
@@ -172,6 +191,12 @@ def as_one_axis_transform(transform: Expression) -> Expression:
 
     So kinematics treats a rotation or translation alike however it was written, also after it was stored as a
     matrix.
+
+    Examples
+    --------
+    >>> turn = kv.rotation_z(kv.position("q"))
+    >>> kv.spatial.as_one_axis_transform(kv.array(turn)).direction
+    (0.0, 0.0, 1.0)
     """
     if isinstance(transform, OneAxisTransform):
         # Along a skew line, the matrix does not separate factors of the amount from those of the direction.
@@ -240,6 +265,7 @@ def _without_axis(transform: Expression) -> Expression:
 
 
 VectorLike: TypeAlias = ExpressionLike
+"""A vector of three elements, numbers or expressions."""
 
 
 def translation(
@@ -248,6 +274,13 @@ def translation(
     """Return the 4×4 translation by (x, y, z) [m], given one by one or as one vector of shape (3,).
 
     Missing coordinates are 0.
+
+    Examples
+    --------
+    >>> kv.translation(kv.position("drawer"), 0, 0.5)[:3, 3]
+    Expression(3,)[drawer, 0, 0.5]
+    >>> kv.translation([1, 2, 3])()[:3, 3]
+    array([1., 2., 3.])
     """
     first = as_expression(x)
     if first.shape and y is None and z is None:
@@ -282,17 +315,38 @@ def _components(
 
 
 def rotation_x(angle: ExpressionLike) -> Expression:
-    """Return the 4×4 rotation by ``angle`` [rad] about x."""
+    """Return the 4×4 rotation by ``angle`` [rad] about x.
+
+    Examples
+    --------
+    >>> (kv.rotation_x(np.pi / 2) @ kv.spatial.point(0, 1, 0))().round(3)
+    array([0., 0., 1., 1.])
+    """
     return rotation_about(X, angle)
 
 
 def rotation_y(angle: ExpressionLike) -> Expression:
-    """Return the 4×4 rotation by ``angle`` [rad] about y."""
+    """Return the 4×4 rotation by ``angle`` [rad] about y.
+
+    Examples
+    --------
+    >>> (kv.rotation_y(np.pi / 2) @ kv.spatial.point(0, 0, 1))().round(3)
+    array([1., 0., 0., 1.])
+    """
     return rotation_about(Y, angle)
 
 
 def rotation_z(angle: ExpressionLike) -> Expression:
-    """Return the 4×4 rotation by ``angle`` [rad] about z."""
+    """Return the 4×4 rotation by ``angle`` [rad] about z.
+
+    Examples
+    --------
+    >>> kv.rotation_z(kv.position("door"))[:2, :2]
+    Expression(2, 2)[cos(door), -sin(door), sin(door), cos(door)]
+    >>> kv.rotation_z(np.deg2rad(90))()[:2, :2].round(3)
+    array([[ 0., -1.],
+           [ 1.,  0.]])
+    """
     return rotation_about(Z, angle)
 
 
@@ -303,6 +357,17 @@ def axis_angle(axis: VectorLike, angle: ExpressionLike) -> Expression:
     ------
     InvalidValueError
         For a constant axis of length zero.
+
+    Examples
+    --------
+    >>> kv.axis_angle((1, 1, 1), 2 * np.pi / 3)().round(3)[:3, :3] + 0.0
+    array([[0., 0., 1.],
+           [1., 0., 0.],
+           [0., 1., 0.]])
+    >>> kv.axis_angle((0, 0, 0), kv.position("q"))
+    Traceback (most recent call last):
+        ...
+    kineverse.errors.InvalidValueError: The axis of a rotation has length zero.
     """
     x, y, z = unit_vector(axis, "The axis of a rotation")
     c, s = cos(angle), sin(angle)
@@ -323,6 +388,14 @@ def rpy(
     """Return the 4×4 rotation by roll about x, then pitch about y, then yaw about z, all fixed axes [rad].
 
     The three are given one by one, or as one vector of shape (3,) alone.
+
+    Examples
+    --------
+    >>> yaw = kv.rpy(0, 0, kv.position("yaw"))
+    >>> yaw[:2, 0]
+    Expression(2,)[cos(yaw), sin(yaw)]
+    >>> kv.spatial.to_rpy(kv.rpy(0.1, 0.2, 0.3))().round(3)
+    array([0.1, 0.2, 0.3])
     """
     names = ("roll", "pitch", "yaw")
     about_x, about_y, about_z = _components("A rotation by roll, pitch and yaw", names, (roll, pitch, yaw))
@@ -334,6 +407,11 @@ def to_rpy(a_R_b: ExpressionLike) -> Expression:
 
     At pitch ±π/2 only a sum of roll and yaw is defined; the result is any yaw with the corresponding roll.
     The derivative does not exist there.
+
+    Examples
+    --------
+    >>> kv.spatial.to_rpy(kv.rpy(0.1, 0.2, 0.3))().round(3)
+    array([0.1, 0.2, 0.3])
     """
     r = rotation_of(a_R_b)
     yaw = arctan2(r[1, 0], r[0, 0])
@@ -362,6 +440,13 @@ def quaternion(
     ------
     InvalidValueError
         For a constant quaternion of length zero, or infinite.
+
+    Examples
+    --------
+    >>> kv.quaternion(0, 0, 1, 1)()[:3, :3].round(3)
+    array([[ 0., -1.,  0.],
+           [ 1.,  0.,  0.],
+           [ 0.,  0.,  1.]])
     """
     q = array(list(_components("A quaternion", ("x", "y", "z", "w"), (x, y, z, w))))
     listener = access_listener(q)
@@ -393,6 +478,11 @@ def to_quaternion(a_R_b: ExpressionLike) -> Expression:
 
     Of the four formulas the one with the largest divisor is selected, so value and derivative are finite for
     every rotation; at angle π the sign is that of the largest component.
+
+    Examples
+    --------
+    >>> kv.spatial.to_quaternion(kv.rotation_z(np.pi / 2))().round(4)
+    array([0.    , 0.    , 0.7071, 0.7071])
     """
     r = rotation_of(a_R_b)
     trace = r[0, 0] + r[1, 1] + r[2, 2]
@@ -418,6 +508,11 @@ def log_so3(a_R_b: ExpressionLike) -> Expression:
     """Return the logarithm of a rotation or transform: axis times angle in [0, π] [rad], shape (3,).
 
     Value and derivative are finite for every rotation, at 0 and at π as well.
+
+    Examples
+    --------
+    >>> kv.spatial.log_so3(kv.rotation_y(kv.position("q")))({"q": 0.5})
+    array([0. , 0.5, 0. ])
     """
     q = to_quaternion(a_R_b)
     v, w = q[:3], q[3]
@@ -431,12 +526,26 @@ def log_so3(a_R_b: ExpressionLike) -> Expression:
 
 
 def rotation_angle(a_R_b: ExpressionLike) -> Expression:
-    """Return the angle of a rotation or transform, in [0, π] [rad]; its gradient at 0 is 0."""
+    """Return the angle of a rotation or transform, in [0, π] [rad]; its gradient at 0 is 0.
+
+    Examples
+    --------
+    >>> turned = kv.rotation_x(0.3) @ kv.rotation_y(kv.position("q"))
+    >>> kv.spatial.rotation_angle(turned)({"q": 0.4}).round(4)
+    np.float64(0.4988)
+    """
     return norm(log_so3(a_R_b))
 
 
 def exp_so3(rotation_vector: VectorLike) -> Expression:
-    """Return the 4×4 rotation by the vector's length [rad] about its direction; smooth at zero."""
+    """Return the 4×4 rotation by the vector's length [rad] about its direction; smooth at zero.
+
+    Examples
+    --------
+    >>> kv.spatial.exp_so3([0, 0, np.pi / 2])()[:2, :2].round(3)
+    array([[ 0., -1.],
+           [ 1.,  0.]])
+    """
     v = _as_vector3(rotation_vector, "A rotation vector")
     s, c, _ = _sine_series(v @ v)
     k = skew(v)
@@ -445,7 +554,16 @@ def exp_so3(rotation_vector: VectorLike) -> Expression:
 
 
 def exp_se3(twist: VectorLike) -> Expression:
-    """Return the 4×4 transform exp(ξ) of a twist (v, ω), shape (6,) [m], [rad]; smooth at zero."""
+    """Return the 4×4 transform exp(ξ) of a twist (v, ω), shape (6,) [m], [rad]; smooth at zero.
+
+    Examples
+    --------
+    >>> screw = kv.spatial.exp_se3([0, 0, 0.1, 0, 0, np.pi])  # half a turn about z, 0.1 m along it
+    >>> screw()[:3].round(3)
+    array([[-1. , -0. ,  0. ,  0. ],
+           [ 0. , -1. ,  0. ,  0. ],
+           [ 0. ,  0. ,  1. ,  0.1]])
+    """
     xi = as_expression(twist)
     if xi.shape != (6,):
         raise ShapeError(f"A twist has shape (6,), linear part first, not {xi.shape}.")
@@ -457,7 +575,13 @@ def exp_se3(twist: VectorLike) -> Expression:
 
 
 def log_se3(a_T_b: ExpressionLike) -> Expression:
-    """Return the twist (v, ω), shape (6,) [m], [rad], whose exponential is the transform; angles below π."""
+    """Return the twist (v, ω), shape (6,) [m], [rad], whose exponential is the transform; angles below π.
+
+    Examples
+    --------
+    >>> kv.spatial.log_se3(kv.translation(1, 0, 0) @ kv.rotation_x(0.5))().round(3)
+    array([1. , 0. , 0. , 0.5, 0. , 0. ])
+    """
     t = as_transform(a_T_b)
     omega = log_so3(t)
     s, c, _ = _sine_series(omega @ omega)
@@ -472,14 +596,34 @@ def log_se3(a_T_b: ExpressionLike) -> Expression:
 
 
 def inverse(a_T_b: ExpressionLike) -> Expression:
-    """Return b_T_a: (Rᵀ, -Rᵀ p), 4×4."""
+    """Return b_T_a: (Rᵀ, -Rᵀ p), 4×4.
+
+    Examples
+    --------
+    >>> world_T_door = kv.translation(1, 0, 0) @ kv.rotation_z(kv.position("door"))
+    >>> door_T_world = kv.inverse(world_T_door)
+    >>> (door_T_world @ world_T_door)({"door": 0.3}).round(9)
+    array([[1., 0., 0., 0.],
+           [0., 1., 0., 0.],
+           [0., 0., 1., 0.],
+           [0., 0., 0., 1.]])
+    """
     t = as_transform(a_T_b)
     r = t[:3, :3].T
     return transform(r, -(r @ t[:3, 3]))
 
 
 def transform(a_R_b: ExpressionLike, a_p: VectorLike) -> Expression:
-    """Return the 4×4 transform of a 3×3 (or 4×4) rotation and a position of shape (3,) [m]."""
+    """Return the 4×4 transform of a 3×3 (or 4×4) rotation and a position of shape (3,) [m].
+
+    Examples
+    --------
+    >>> a_T_b = kv.transform(kv.rotation_z(kv.position("q")), [1, 2, 3])
+    >>> a_T_b({"q": np.pi / 2})[:3].round(3)
+    array([[ 0., -1.,  0.,  1.],
+           [ 1.,  0.,  0.,  2.],
+           [ 0.,  0.,  1.,  3.]])
+    """
     r = rotation_of(a_R_b)
     p = _as_vector3(a_p, "A position")
     upper = np.concatenate([r, p.reshape(3, 1)], axis=1)
@@ -487,7 +631,13 @@ def transform(a_R_b: ExpressionLike, a_p: VectorLike) -> Expression:
 
 
 def rotation_of(a_T_b: ExpressionLike) -> Expression:
-    """Return the 3×3 rotation of a 4×4 transform; a 3×3 matrix is returned as it is."""
+    """Return the 3×3 rotation of a 4×4 transform; a 3×3 matrix is returned as it is.
+
+    Examples
+    --------
+    >>> kv.spatial.rotation_of(kv.translation(1, 2, 3)).shape
+    (3, 3)
+    """
     t = as_expression(a_T_b)
     if t.shape == (3, 3):
         return t
@@ -495,7 +645,13 @@ def rotation_of(a_T_b: ExpressionLike) -> Expression:
 
 
 def position_of(a_T_b: ExpressionLike) -> Expression:
-    """Return the position of frame b in a, shape (3,) [m]."""
+    """Return the position of frame b in a, shape (3,) [m].
+
+    Examples
+    --------
+    >>> kv.spatial.position_of(kv.rotation_z(kv.position("q")) @ kv.translation(0.4, 0, 0))
+    Expression(3,)[0.4*cos(q), 0.4*sin(q), 0]
+    """
     return as_transform(a_T_b)[:3, 3]
 
 
@@ -503,6 +659,11 @@ def point(x: ExpressionLike, y: ExpressionLike | None = None, z: ExpressionLike 
     """Return the homogeneous coordinates (x, y, z, 1) of a point, which transforms rotate and translate.
 
     The three are given one by one, or as one vector of shape (3,) alone.
+
+    Examples
+    --------
+    >>> (kv.translation(1, 0, 0) @ kv.spatial.point(0, 0.2, 0))()
+    array([1. , 0.2, 0. , 1. ])
     """
     return array([*_components("A point", ("x", "y", "z"), (x, y, z)), 1])
 
@@ -511,18 +672,36 @@ def vector(x: ExpressionLike, y: ExpressionLike | None = None, z: ExpressionLike
     """Return the homogeneous coordinates (x, y, z, 0) of a direction, which transforms only rotate.
 
     The three are given one by one, or as one vector of shape (3,) alone.
+
+    Examples
+    --------
+    >>> (kv.translation(1, 0, 0) @ kv.spatial.vector(0, 0.2, 0))()
+    array([0. , 0.2, 0. , 0. ])
     """
     return array([*_components("A direction", ("x", "y", "z"), (x, y, z)), 0])
 
 
 def skew(v: VectorLike) -> Expression:
-    """Return the 3×3 matrix [v]× with ``skew(v) @ w = v × w``."""
+    """Return the 3×3 matrix [v]× with ``skew(v) @ w = v × w``.
+
+    Examples
+    --------
+    >>> (kv.spatial.skew([0, 0, 1]) @ np.array([1, 0, 0]))()
+    array([0., 1., 0.])
+    """
     x, y, z = _as_vector3(v, "A vector")
     return array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
 
 
 def adjoint(a_T_b: ExpressionLike) -> Expression:
-    """Return the 6×6 matrix that maps twists (v, ω) in frame b to twists in frame a."""
+    """Return the 6×6 matrix that maps twists (v, ω) in frame b to twists in frame a.
+
+    Examples
+    --------
+    >>> a_T_b = kv.translation(0, 1, 0)
+    >>> (kv.spatial.adjoint(a_T_b) @ np.array([0, 0, 0, 0, 0, 1]))()
+    array([1., 0., 0., 0., 0., 1.])
+    """
     t = as_transform(a_T_b)
     r = t[:3, :3]
     upper = np.concatenate([r, skew(t[:3, 3]) @ r], axis=1)
@@ -531,7 +710,17 @@ def adjoint(a_T_b: ExpressionLike) -> Expression:
 
 
 def as_transform(a_T_b: ExpressionLike) -> Expression:
-    """Return the argument as an expression of shape (4, 4)."""
+    """Return the argument as an expression of shape (4, 4).
+
+    Examples
+    --------
+    >>> kv.spatial.as_transform(np.eye(4)).shape
+    (4, 4)
+    >>> kv.spatial.as_transform([1, 2, 3])
+    Traceback (most recent call last):
+        ...
+    kineverse.errors.ShapeError: A transform is a 4×4 matrix, not of shape (3,).
+    """
     t = as_expression(a_T_b)
     if t.shape != (4, 4):
         raise ShapeError(f"A transform is a 4×4 matrix, not of shape {t.shape}.")
@@ -545,6 +734,11 @@ def unit_vector(v: VectorLike, what: str = "The vector") -> Expression:
     ------
     InvalidValueError
         For a constant vector of length zero.
+
+    Examples
+    --------
+    >>> kv.spatial.unit_vector([3, 0, 4])()
+    array([0.6, 0. , 0.8])
     """
     expression = _as_vector3(v, what)
     listener = access_listener(expression)

@@ -56,6 +56,18 @@ class State(Mapping[Symbol, float]):
     DuplicateNameError
         If values are given for a symbol and for its name; likewise, later, for access by a name that several
         of the symbols have.
+
+    Examples
+    --------
+    >>> state = kv.State({"door": 0.5, "drawer": 0.1}, stamp=12.0)
+    >>> state["door"]
+    0.5
+    >>> state | {"door": 0.7}
+    State({door: 0.7, drawer: 0.1}, stamp=12)
+    >>> state.updated({"dor": 0.7})
+    Traceback (most recent call last):
+        ...
+    kineverse.errors.UnknownNameError: The state has no value of 'dor', so there is nothing to ...
     """
 
     __slots__ = ("_names", "_values", "source", "stamp")
@@ -146,6 +158,14 @@ class State(Mapping[Symbol, float]):
         """Return the value of a symbol, else the value that was given by its name, else None.
 
         A name in a state is that of a degree of freedom, or else of the parameter of that name.
+
+        Examples
+        --------
+        >>> door = kv.position("door")
+        >>> kv.State({"door": 0.5}).given(door)
+        0.5
+        >>> kv.State({"drawer": 0.5}).given(door) is None
+        True
         """
         value = self._values.get(symbol)
         if value is None and symbol.role != "dof":
@@ -162,6 +182,14 @@ class State(Mapping[Symbol, float]):
         ------
         UnknownNameError
             For symbols without a value.
+
+        Examples
+        --------
+        >>> model = kv.load("kitchen")
+        >>> f = kv.compile(model.fk("kitchen/fridge_door_handle")[:3, 3])
+        >>> state = model.default_state()
+        >>> f(state.vector(f.inputs)).round(3)
+        array([ 1.137, -1.312,  1.184])
         """
         try:
             return np.fromiter(map(self._values.__getitem__, symbols), np.float64, len(symbols))
@@ -190,6 +218,11 @@ class State(Mapping[Symbol, float]):
         ------
         UnknownNameError
             For a symbol or name without a value in the state, with similar ones.
+
+        Examples
+        --------
+        >>> kv.State({"door": 0.5, "drawer": 0.1}, stamp=1.0).updated({"door": 0.7}, stamp=2.0).stamp
+        2.0
         """
         changed: dict[Symbol, float] = {}
         for key, value in _items(values):
@@ -209,6 +242,11 @@ class State(Mapping[Symbol, float]):
         ------
         DuplicateNameError
             For a symbol of the state; :meth:`updated` changes its value.
+
+        Examples
+        --------
+        >>> kv.State({"door": 0.5}).extended({"drawer": 0.1})
+        State({door: 0.5, drawer: 0.1})
         """
         added = State(values)._values
         for symbol in added:
@@ -272,7 +310,7 @@ class State(Mapping[Symbol, float]):
         return f"State({{{shown}{more}}}{when})"
 
     def _repr_html_(self) -> str:
-        from kineverse.expressions.printing import html_table  # for start-up time
+        from kineverse._rich_display import html_table  # for start-up time
 
         about = [f"{len(self)} values"]
         about += [] if self.stamp is None else [f"at {self.stamp:g} s"]

@@ -33,11 +33,14 @@ __all__ = [
 ]
 
 Role: TypeAlias = Literal["dof", "parameter", "contact", "location"]
+"""Kind of variable that a symbol stands for."""
 
 ROLES: tuple[Role, ...] = get_args(Role)
+"""All roles of symbols."""
 _UNPRINTABLE = re.compile("[\x00-\x1f\ud800-\udfff]")
 _ORDER = re.compile("0|[1-9][0-9]{0,8}")
 ORDER_NAMES = ("position", "velocity", "acceleration", "jerk", "snap")
+"""Names of the orders of time derivatives, as they stand after the colon of a name."""
 
 _INTERNED: dict[tuple[str, int, str, float | None], Symbol] = {}
 _INTERNING = threading.Lock()
@@ -56,6 +59,16 @@ class Symbol(Expression):
         The kind of variable: ``dof``, ``parameter``, ``contact``, ``location``.
     value
         The default value of a parameter; None for other roles.
+
+    Examples
+    --------
+    >>> q = kv.position("kitchen/fridge_door")
+    >>> q.path, q.order, q.role
+    ('kitchen/fridge_door', 0, 'dof')
+    >>> q.derivative()
+    kitchen/fridge_door:velocity
+    >>> 1 + 2 * q
+    1 + 2*kitchen/fridge_door
     """
 
     __slots__ = ("_text", "order", "path", "role", "sort_key", "value")
@@ -127,6 +140,15 @@ class Symbol(Expression):
         ------
         ExpressionError
             For parameters.
+
+        Examples
+        --------
+        >>> kv.position("door").derivative() == kv.velocity("door")
+        True
+        >>> kv.parameter("length", 0.4).derivative()
+        Traceback (most recent call last):
+            ...
+        kineverse.errors.ExpressionError: Parameter 'length' has no derivative: it does not change with time.
         """
         if not self.has_derivative:
             raise ExpressionError(f"Parameter '{self}' has no derivative: it does not change with time.")
@@ -139,6 +161,11 @@ class Symbol(Expression):
         ------
         ExpressionError
             For positions and parameters.
+
+        Examples
+        --------
+        >>> kv.velocity("door").integral()
+        door
         """
         if self.order == 0:
             raise ExpressionError(f"'{self}' is not the derivative of anything.")
@@ -195,17 +222,38 @@ def _check(path: str, order: int, role: str, value: float | None) -> None:
 
 
 def symbol(path: str, order: int = 0, role: Role = "dof") -> Symbol:
-    """Return the symbol of any order and role."""
+    """Return the symbol of any order and role.
+
+    Examples
+    --------
+    >>> kv.symbols.symbol("door", order=2)
+    door:acceleration
+    """
     return Symbol(path, order, role)
 
 
 def position(path: str) -> Symbol:
-    """Return the position symbol of a degree of freedom."""
+    """Return the position symbol of a degree of freedom.
+
+    Examples
+    --------
+    >>> q = kv.position("door")
+    >>> (1 - np.cos(q)).gradient()
+    {door:velocity: sin(door)}
+    """
     return Symbol(path)
 
 
 def velocity(path: str) -> Symbol:
-    """Return the velocity symbol of a degree of freedom."""
+    """Return the velocity symbol of a degree of freedom.
+
+    Examples
+    --------
+    >>> kv.velocity("door")
+    door:velocity
+    >>> kv.velocity("door") == kv.position("door").derivative()
+    True
+    """
     return Symbol(path, 1)
 
 
@@ -218,6 +266,13 @@ def parameter(path: str, value: float) -> Symbol:
     """Return the symbol of a constant parameter with a default value.
 
     ``D`` of a parameter is empty. Parameters of one path with different values are different symbols.
+
+    Examples
+    --------
+    >>> length = kv.parameter("arm/length", 0.4)
+    >>> x = length * np.cos(kv.position("arm"))
+    >>> x({"arm": 0}), x({"arm": 0, "arm/length": 0.5})
+    (np.float64(0.4), np.float64(0.5))
     """
     number = None if isinstance(value, bool) else as_number(value)
     if number is None:
@@ -226,7 +281,13 @@ def parameter(path: str, value: float) -> Symbol:
 
 
 def symbol_name(path: str, order: int) -> str:
-    """Return the text name; ``%`` and ``:`` in the path are percent-escaped, so it can be parsed."""
+    """Return the text name; ``%`` and ``:`` in the path are percent-escaped, so it can be parsed.
+
+    Examples
+    --------
+    >>> kv.symbols.symbol_name("kitchen/door", 1)
+    'kitchen/door:velocity'
+    """
     escaped = path.replace("%", "%25").replace(":", "%3A") if "%" in path or ":" in path else path
     if order == 0:
         return escaped
@@ -240,6 +301,11 @@ def parse_symbol_name(name: str) -> tuple[str, int]:
     ------
     ExpressionError
         If the part behind the colon is not an order.
+
+    Examples
+    --------
+    >>> kv.symbols.parse_symbol_name("kitchen/door:velocity")
+    ('kitchen/door', 1)
     """
     escaped, colon, suffix = name.partition(":")
     path = re.sub("%(25|3A)", lambda m: {"25": "%", "3A": ":"}[m[1]], escaped)

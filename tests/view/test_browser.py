@@ -209,6 +209,10 @@ def test_nearest_pairs_are_shown_and_follow_the_sliders(opened):
     until(page, lambda: not greenish(shot(page)).any())
 
 
+def vivid(image):
+    return image.max(axis=-1) - image.min(axis=-1) > 100
+
+
 def corners(viewer, camera):
     """Project the corners of the scene into the picture of a browser, (N, 2) in [-1, 1] if they are in it."""
     poses = {name: viewer.pose(name) for name in viewer.model.frames}
@@ -244,6 +248,9 @@ def test_the_camera_frames_the_model_in_any_window_until_it_is_moved(browser):
             until(page, lambda folded=folded: (canvas.bounding_box()["height"] > 750) is folded)
             until(page, lambda: canvas.bounding_box()["height"] <= panel.bounding_box()["y"] + 1)
             until(page, lambda: 0.75 < np.abs(corners(viewer, camera)).max() < 0.95)
+            if not folded:
+                # The model is what is seen of the page first: of its red and blue fronts, a tenth of the screen.
+                until(page, lambda: vivid(browsers.shot(page, 390, 844)).mean() > 0.1)
         moved, reports = camera.position + 0.3, []
         client.camera.on_update(lambda camera: reports.append(camera.position.copy()))
         camera.position = moved

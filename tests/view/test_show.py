@@ -75,11 +75,9 @@ def test_show_in_a_notebook_returns_the_page_as_the_result_of_the_cell(monkeypat
     shell = types.SimpleNamespace(kernel=object())
     monkeypatch.setitem(sys.modules, "IPython", types.SimpleNamespace(get_ipython=lambda: shell))
     with show(cabinet(), port=0) as page:
-        assert page._repr_html_() == (
-            f'<iframe style="border:none" src="{page.address}" width="100%" height="600"></iframe>'
-        )
+        assert f'<object style="border:none" data="{page.address}"' in page._repr_mimebundle_()["text/html"]
         assert (capfd.readouterr().err, opened) == ("", [])
-    assert "taken down" in page._repr_html_()
+    assert "taken down" in page._repr_mimebundle_()["text/html"]
 
 
 def test_show_without_a_screen_opens_no_browser(monkeypatch, opened):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import json
+import re
 import sys
 import tempfile
 from collections.abc import Iterator
@@ -13,6 +14,7 @@ from typing import Any
 from inventory.bounded import ROOT, run
 
 SMALL, LARGE, CROWDED = 100, 600, 26
+_EXAMPLES = re.compile(r'^ *Examples\n *-{8}\n.*?(?=^ *""")', re.MULTILINE | re.DOTALL)
 _COUNT = """
 import json, sys
 def count():
@@ -78,8 +80,8 @@ def find_modules(*folders: Path) -> dict[str, Path]:
 
 
 def count_lines(files: dict[str, Path]) -> dict[str, int]:
-    """Return the number of lines of some modules."""
-    return {name: _lines(file) for name, file in files.items()}
+    """Return the number of lines of some modules, without the examples in their docstrings."""
+    return {name: _lines(file) - _lines_of_examples(file) for name, file in files.items()}
 
 
 def find_importers(files: dict[str, Path]) -> dict[str, set[str]]:
@@ -115,3 +117,7 @@ def _module(file: Path) -> str:
 
 def _lines(file: Path) -> int:
     return len(file.read_text("utf-8").splitlines())
+
+
+def _lines_of_examples(file: Path) -> int:
+    return sum(match[0].count("\n") for match in _EXAMPLES.finditer(file.read_text("utf-8")))

@@ -32,7 +32,13 @@ from .limits import check_speed_limit, limit_constraints
 
 @dataclass(frozen=True, kw_only=True)
 class Base(Joint):
-    """Base of the mobile bases: planar pose on the floor, limits of speeds."""
+    """Base of the mobile bases: planar pose on the floor, limits of speeds.
+
+    See Also
+    --------
+    kineverse.articulations.OmniBase
+    kineverse.articulations.DifferentialDrive
+    """
 
     @property
     def coordinates(self) -> tuple[Symbol, Symbol, Symbol]:
@@ -92,6 +98,19 @@ class OmniBase(Base, document_kind="OmniBase"):
         Limit of the speed √(ẋ² + ẏ²) [m/s]; None for no limit.
     turn
         Limit of the angular speed ``|θ̇|`` [rad/s]; None for no limit.
+
+    Examples
+    --------
+    >>> model = kv.load("hsr")
+    >>> with model.edit() as edit:
+    ...     edit.apply(
+    ...         kv.articulations.OmniBase(name="base", parent="world", child="base", speed=0.3, turn=1.0)
+    ...     )
+    ...     edit.attach("hsr/base_link", parent="base", transform=np.eye(4))
+    'joint base'
+    'attach hsr/base_link to base'
+    >>> model.degrees_of_freedom[:3]
+    (base/angle, base/x, base/y)
     """
 
     speed: float | None = 1.0
@@ -135,6 +154,22 @@ class DifferentialDrive(Base, document_kind="DifferentialDrive"):
     ------
     InvalidValueError
         For a radius or a track that is not positive, or one wheel on both sides.
+
+    Examples
+    --------
+    >>> model = kv.Model()
+    >>> with model.edit() as edit:
+    ...     edit.apply(
+    ...         kv.articulations.DifferentialDrive(
+    ...             name="base", parent="world", child="base", radius=0.1, track=0.5
+    ...         )
+    ...     )
+    'joint base'
+    >>> model.speeds_of("base")
+    (base/left_wheel:velocity, base/right_wheel:velocity)
+    >>> forward = {"base/left_wheel:velocity": 2.0, "base/right_wheel:velocity": 2.0}
+    >>> model.integrate(model.default_state(), forward, dt=1.0)
+    State({base/angle: 0, base/x: 0.2, base/y: 0})
     """
 
     radius: Size | tuple[Size, Size]
@@ -205,7 +240,7 @@ class Ackermann(Base, document_kind="Ackermann"):
 
     Coordinates are x, y [m], θ [rad] and the steering angle ``name/steering``, δ [rad], of a wheel in the
     middle of the front axle, positive to the left. Speeds are that of the rear axle, v = ``name/drive``
-    [m/s], and δ̇. With the wheelbase L,
+    [m/s], and δ̇. With the wheelbase L::
 
         ẋ = v cos θ,        ẏ = v sin θ,        θ̇ = v tan(δ)/L.
 
@@ -224,6 +259,18 @@ class Ackermann(Base, document_kind="Ackermann"):
     ------
     InvalidValueError
         For a wheelbase that is not positive, or a steering angle outside (0, π/2).
+
+    Examples
+    --------
+    >>> model = kv.Model()
+    >>> with model.edit() as edit:
+    ...     edit.apply(
+    ...         kv.articulations.Ackermann(name="car", parent="world", child="car", wheelbase=2.5)
+    ...     )
+    'joint car'
+    >>> state = model.default_state().updated({"car/steering": 0.3})
+    >>> model.integrate(state, {"car/drive:velocity": 1.0}, dt=1.0)
+    State({car/angle: 0.123734, car/steering: 0.3, car/x: 0.99745, car/y: 0.0617884})
     """
 
     wheelbase: Size
@@ -264,7 +311,7 @@ class Mecanum(Base, document_kind="Mecanum"):
 
     The coordinates x, y [m] and θ [rad] move by the speeds of the four wheels, front left, front right, rear
     left, rear right, each positive where it drives forward. With the radius r, the track b and the wheelbase
-    L, the velocity and the angular speed in the axes of the base are
+    L, the velocity and the angular speed in the axes of the base are::
 
         v_x = r/4 ( ω_fl + ω_fr + ω_rl + ω_rr)
         v_y = r/4 (-ω_fl + ω_fr + ω_rl - ω_rr)
@@ -294,6 +341,20 @@ class Mecanum(Base, document_kind="Mecanum"):
     ------
     InvalidValueError
         For lengths that are not positive, or another number of wheels than four.
+
+    Examples
+    --------
+    >>> model = kv.Model()
+    >>> with model.edit() as edit:
+    ...     edit.apply(
+    ...         kv.articulations.Mecanum(
+    ...             name="base", parent="world", child="base", radius=0.1, track=0.4, wheelbase=0.5
+    ...         )
+    ...     )
+    'joint base'
+    >>> sideways = dict(zip(model.speeds, (-1, 1, 1, -1)))
+    >>> model.integrate(model.default_state(), sideways, dt=1.0)
+    State({base/angle: 0, base/x: 0, base/y: 0.1})
     """
 
     radius: Size

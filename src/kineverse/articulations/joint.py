@@ -107,6 +107,11 @@ class Joint(PlacedOperation):
         parent_T_joint, the pose of the child at coordinate 0.
     dynamics
         Dynamic parameters as (name, value) pairs: effort [N] or [N m], damping, friction, …
+
+    See Also
+    --------
+    kineverse.Fixed
+    kineverse.Revolute
     """
 
     child: str
@@ -150,7 +155,21 @@ class Joint(PlacedOperation):
 
 @dataclass(frozen=True, kw_only=True)
 class Fixed(Joint, document_kind="Fixed"):
-    """Fixed joint: parent_T_child = origin."""
+    """Fixed joint: parent_T_child = origin.
+
+    Examples
+    --------
+    >>> model = kv.load("kitchen")
+    >>> with model.edit() as edit:
+    ...     edit.apply(
+    ...         kv.Fixed(
+    ...             name="lamp", parent="kitchen/sink_area", child="lamp", origin=kv.translation(0, 0, 0.3)
+    ...         )
+    ...     )
+    'joint lamp'
+    >>> model.fk("lamp", relative_to="kitchen/sink_area")()[:3, 3]
+    array([0. , 0. , 0.3])
+    """
 
     def apply(self, model: ReadRecorder) -> Writes:
         """Write the child frame."""
@@ -170,6 +189,11 @@ class OneAxisMotion(Joint):
         Limits of q [m] or [rad], numbers or expressions; None leaves that side open.
     velocity
         Limit of ``|q̇|`` [m/s] or [rad/s]; None for no limit.
+
+    See Also
+    --------
+    kineverse.Revolute
+    kineverse.articulations.Gearbox
     """
 
     axis: AxisLike = (1.0, 0.0, 0.0)
@@ -207,6 +231,11 @@ class OneDofJoint(OneAxisMotion):
     position
         Expression for q in place of a degree of freedom: a mimic joint, linear or not. The limits are
         constraints on that expression.
+
+    See Also
+    --------
+    kineverse.Revolute
+    kineverse.Prismatic
     """
 
     position: Expression | None = None

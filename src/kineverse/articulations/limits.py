@@ -23,6 +23,19 @@ class Limits:
         Limits of the coordinate [m] or [rad], numbers or expressions; None leaves that side open.
     velocity
         Limit of the magnitude of its speed [m/s] or [rad/s]; None for no limit.
+
+    Examples
+    --------
+    >>> model = kv.Model()
+    >>> with model.edit() as edit:
+    ...     edit.apply(
+    ...         kv.articulations.Cylindrical(
+    ...             name="bolt", parent="world", child="bolt", slide=kv.Limits(0, 0.05, velocity=0.1)
+    ...         )
+    ...     )
+    'joint bolt'
+    >>> model.limits("bolt/slide"), model.limits("bolt/turn")
+    ((0.0, 0.05), (-inf, inf))
     """
 
     lower: ExpressionLike | None = None

@@ -57,6 +57,16 @@ def speed_lock(
     ------
     InvalidValueError
         For an expression that is not a scalar, a limit that is not positive, or another direction.
+
+    Examples
+    --------
+    >>> door, handle = kv.position("door"), kv.position("handle")
+    >>> lock = kv.articulations.speed_lock(door, open_if=handle > 0.5, blocks="forward")
+    >>> _, speed, upper = lock
+    >>> upper({"handle": 0.0}), upper({"handle": 0.6})
+    (np.float64(0.0), np.float64(1.0))
+    >>> upper.gradient()  # pressing the handle opens it
+    {handle:velocity: 1}
     """
     rate = check_scalar(speed, "The speed of a lock")
     if not any(s.order for s in rate.symbols):
@@ -83,7 +93,7 @@ def position_lock(
 
     Note that a position that is *outside* already is free, and free to return. A bolt that springs out
     while the door stands open holds nothing; it holds the door once that is shut. With c = open_if, the
-    bounds are
+    bounds are::
 
         locked = ~c & (lower - margin < q) & (q < upper + margin)
         lower  = where(locked, lower, -∞),     upper = where(locked, upper, ∞)
@@ -109,6 +119,19 @@ def position_lock(
     InvalidValueError
         For an expression that is not a scalar, bounds that leave nothing between them, NaN, or a margin that
         is not positive.
+
+    Examples
+    --------
+    >>> door, bolt = kv.position("door"), kv.position("bolt")
+    >>> lock = kv.articulations.position_lock(door, open_if=bolt > 0.01, lower=0, upper=0)
+    >>> model = kv.Model()
+    >>> with model.edit() as edit:
+    ...     edit.add_frame("door", parent="world", transform=kv.rotation_z(door))
+    ...     edit.constrain("door/lock", *lock)
+    'frame door'
+    'constraint door/lock'
+    >>> model.limits("door", {"door": 0, "bolt": 0}), model.limits("door", {"door": 0, "bolt": 0.02})
+    ((0.0, 0.0), (-inf, inf))
     """
     if not check_scalar(q, "The position of a lock").symbols or any(s.order for s in q.symbols):
         raise InvalidValueError(f"The position of a lock is an expression of positions, not {q!r}.")
@@ -151,6 +174,13 @@ def tabulated_limit(
     ------
     InvalidValueError
         For a driver that is not a scalar, or points that do not increase, are too few or NaN.
+
+    Examples
+    --------
+    >>> lift = kv.position("lift")
+    >>> upper = kv.articulations.tabulated_limit(lift, {0.0: 0.2, 0.5: 1.5})
+    >>> upper({"lift": 0.25}).round(3), upper({"lift": 2.0})
+    (np.float64(0.85), np.float64(1.5))
     """
     x = check_scalar(driver, "The driver of a table of limits")
     try:

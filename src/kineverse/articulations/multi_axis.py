@@ -43,6 +43,18 @@ class Planar(Joint, document_kind="Planar"):
         Limits of both x and y [m]; None leaves that side open.
     velocity
         Limit of both ``|ẋ|`` and ``|ẏ|`` [m/s]; None for no limit.
+
+    Examples
+    --------
+    >>> model = kv.Model()
+    >>> with model.edit() as edit:
+    ...     edit.apply(kv.Planar(name="box", parent="world", child="box", lower=-1, upper=1))
+    'joint box'
+    >>> model.degrees_of_freedom
+    (box/angle, box/x, box/y)
+    >>> model.violations({"box/x": 0.5, "box/y": 1.25, "box/angle": 0})
+    1 violated
+      box/y/position: -1 <= 1.25 <= 1 is off by 0.25
     """
 
     axis: AxisLike = (0.0, 0.0, 1.0)
@@ -87,6 +99,19 @@ class Universal(Joint, document_kind="Universal"):
     ------
     InvalidValueError
         For axes that are not perpendicular, with the angle between them.
+
+    Examples
+    --------
+    >>> model = kv.Model()
+    >>> with model.edit() as edit:
+    ...     edit.apply(
+    ...         kv.articulations.Universal(
+    ...             name="cross", parent="world", child="shaft", first=(1, 0, 0), second=(0, 1, 0)
+    ...         )
+    ...     )
+    'joint cross'
+    >>> model.degrees_of_freedom
+    (cross/first, cross/second)
     """
 
     first: AxisLike = (1.0, 0.0, 0.0)
@@ -156,6 +181,18 @@ class Ball(Joint, document_kind="Ball"):
     ------
     InvalidValueError
         For a cone or a twist outside (0, π], or a negative limit of the speed.
+
+    Examples
+    --------
+    >>> model = kv.Model()
+    >>> with model.edit() as edit:
+    ...     edit.apply(
+    ...         kv.articulations.Ball(name="hip", parent="world", child="leg", axis=(0, 0, 1), cone=0.8)
+    ...     )
+    'joint hip'
+    >>> tilted = model.integrate(model.default_state(), {"hip/wx:velocity": 1.0}, dt=1.0)
+    >>> [name for name, *_ in model.violations(tilted)]
+    ['hip/cone']
     """
 
     axis: AxisLike = (0.0, 0.0, 1.0)
@@ -208,6 +245,15 @@ class Floating(Joint, document_kind="Floating"):
     Seven coordinates ``name/x|y|z`` [m] and ``name/qx|qy|qz|qw``, six speeds: the velocities of x, y, z
     [m/s], and the angular velocity ω of the child in its own axes, ``name/wx|wy|wz`` [rad/s]. The quaternion
     has the rate q̇ = ½ q ⊗ (ω, 0), which preserves its length. The pose normalises the quaternion.
+
+    Examples
+    --------
+    >>> model = kv.Model()
+    >>> with model.edit() as edit:
+    ...     edit.apply(kv.Floating(name="cup", parent="world", child="cup"))
+    'joint cup'
+    >>> model.speeds_of("cup")
+    (cup/wx:velocity, cup/wy:velocity, cup/wz:velocity, cup/x:velocity, cup/y:velocity, cup/z:velocity)
     """
 
     def apply(self, model: ReadRecorder) -> Writes:

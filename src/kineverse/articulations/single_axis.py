@@ -22,7 +22,21 @@ from .limits import FREE, Limits, check_limits
 
 @dataclass(frozen=True, kw_only=True)
 class Revolute(OneDofJoint, document_kind="Revolute"):
-    """Revolute joint (hinge): parent_T_child = origin · rotation(axis, q), q in [rad]."""
+    """Revolute joint (hinge): parent_T_child = origin · rotation(axis, q), q in [rad].
+
+    Examples
+    --------
+    >>> model = kv.Model()
+    >>> with model.edit() as edit:
+    ...     edit.apply(
+    ...         kv.Revolute(name="door", parent="world", child="door", axis=(0, 0, 1), lower=0, upper=1.6)
+    ...     )
+    ...     edit.add_frame("handle", parent="door", transform=kv.translation(0.4, 0, 0))
+    'joint door'
+    'frame handle'
+    >>> model.fk("handle")({"door": 0.5})[:3, 3].round(3)
+    array([0.351, 0.192, 0.   ])
+    """
 
     def motion(self, q: Expression) -> tuple[Pose | Expression, ...]:
         """Return the factors of joint_T_child."""
@@ -31,12 +45,37 @@ class Revolute(OneDofJoint, document_kind="Revolute"):
 
 @dataclass(frozen=True, kw_only=True)
 class Continuous(Revolute, document_kind="Continuous"):
-    """Revolute joint without end stops, q in [rad]; usually without position limits."""
+    """Revolute joint without end stops, q in [rad]; usually without position limits.
+
+    Examples
+    --------
+    >>> model = kv.Model()
+    >>> with model.edit() as edit:
+    ...     edit.apply(kv.Continuous(name="wheel", parent="world", child="rim", axis=(0, 1, 0)))
+    'joint wheel'
+    >>> model.limits("wheel")
+    (-inf, inf)
+    >>> model.fk("rim")({"wheel": np.pi})[:3, 0].round(3) + 0.0
+    array([-1.,  0.,  0.])
+    """
 
 
 @dataclass(frozen=True, kw_only=True)
 class Prismatic(OneDofJoint, document_kind="Prismatic"):
-    """Prismatic joint (slider): parent_T_child = origin · translation(axis · q), q in [m]."""
+    """Prismatic joint (slider): parent_T_child = origin · translation(axis · q), q in [m].
+
+    Examples
+    --------
+    >>> model = kv.Model()
+    >>> with model.edit() as edit:
+    ...     edit.apply(kv.Prismatic(name="drawer", parent="world", child="drawer", lower=0, upper=0.4))
+    'joint drawer'
+    >>> model.fk("drawer")({"drawer": 0.25})[:3, 3]
+    array([0.25, 0.  , 0.  ])
+    >>> model.violations({"drawer": 0.5})
+    1 violated
+      drawer/position: 0 <= 0.5 <= 0.4 is off by 0.1
+    """
 
     def motion(self, q: Expression) -> tuple[Pose | Expression, ...]:
         """Return the factors of joint_T_child."""
@@ -57,6 +96,17 @@ class Screw(OneDofJoint, document_kind="Screw"):
     ------
     InvalidValueError
         For a pitch of 0 or NaN.
+
+    Examples
+    --------
+    >>> model = kv.Model()
+    >>> with model.edit() as edit:
+    ...     edit.apply(
+    ...         kv.articulations.Screw(name="lid", parent="world", child="lid", axis=(0, 0, 1), pitch=0.004)
+    ...     )
+    'joint lid'
+    >>> model.fk("lid")({"lid": np.pi})[2, 3]  # half a turn
+    np.float64(0.002)
     """
 
     pitch: Size
@@ -92,6 +142,19 @@ class Cylindrical(Joint, document_kind="Cylindrical"):
         Direction in the joint's frame, of any length but zero.
     slide, turn
         Limits of s and of φ.
+
+    Examples
+    --------
+    >>> model = kv.Model()
+    >>> with model.edit() as edit:
+    ...     edit.apply(
+    ...         kv.articulations.Cylindrical(
+    ...             name="bolt", parent="world", child="bolt", axis=(0, 0, 1), slide=kv.Limits(0, 0.05)
+    ...         )
+    ...     )
+    'joint bolt'
+    >>> model.fk("bolt")({"bolt/slide": 0.02, "bolt/turn": 0.5})[2, 3]
+    np.float64(0.02)
     """
 
     axis: AxisLike = (1.0, 0.0, 0.0)

@@ -35,6 +35,10 @@ class Transmission(OneAxisMotion):
     ------
     InvalidValueError
         For a driver without a position or with several coordinates, or a constant one.
+
+    See Also
+    --------
+    kineverse.articulations.Gearbox
     """
 
     driver: str | Expression
@@ -94,6 +98,23 @@ class Gearbox(Transmission, document_kind="Gearbox"):
     ------
     InvalidValueError
         For a ratio of 0 or NaN.
+
+    Examples
+    --------
+    >>> model = kv.Model()
+    >>> with model.edit() as edit:
+    ...     edit.apply(kv.Continuous(name="motor", parent="world", child="motor", axis=(0, 0, 1)))
+    ...     edit.apply(
+    ...         kv.articulations.Gearbox(
+    ...             name="wheel", parent="world", child="wheel", axis=(0, 0, 1), driver="motor", ratio=-0.25
+    ...         )
+    ...     )
+    'joint motor'
+    'joint wheel'
+    >>> model.degrees_of_freedom
+    (motor,)
+    >>> kv.spatial.to_rpy(model.fk("wheel"))({"motor": 2.0})
+    array([ 0. ,  0. , -0.5])
     """
 
     ratio: float
@@ -129,6 +150,21 @@ class RackAndPinion(Transmission, document_kind="RackAndPinion"):
     ------
     InvalidValueError
         For a radius that is not positive.
+
+    Examples
+    --------
+    >>> model = kv.Model()
+    >>> with model.edit() as edit:
+    ...     edit.apply(kv.Continuous(name="pinion", parent="world", child="pinion", axis=(0, 0, 1)))
+    ...     edit.apply(
+    ...         kv.articulations.RackAndPinion(
+    ...             name="rack", parent="world", child="rack", axis=(1, 0, 0), driver="pinion", radius=0.02
+    ...         )
+    ...     )
+    'joint pinion'
+    'joint rack'
+    >>> model.fk("rack")({"pinion": 2.0})[0, 3]
+    np.float64(0.04)
     """
 
     radius: float
@@ -173,6 +209,28 @@ class Cam(Transmission, document_kind="Cam"):
     InvalidValueError
         For angles that do not increase, different numbers of angles and values, NaN, or a periodic profile
         whose ends differ.
+
+    Examples
+    --------
+    >>> model = kv.Model()
+    >>> with model.edit() as edit:
+    ...     edit.apply(kv.Continuous(name="shaft", parent="world", child="cam", axis=(0, 1, 0)))
+    ...     edit.apply(
+    ...         kv.articulations.Cam(
+    ...             name="valve",
+    ...             parent="world",
+    ...             child="valve",
+    ...             axis=(0, 0, 1),
+    ...             driver="shaft",
+    ...             angles=(0, np.pi, 2 * np.pi),
+    ...             values=(0, 0.01, 0),
+    ...             periodic=True,
+    ...         )
+    ...     )
+    'joint shaft'
+    'joint valve'
+    >>> model.fk("valve")({"shaft": np.pi})[2, 3]
+    np.float64(0.01)
     """
 
     angles: tuple[float, ...]

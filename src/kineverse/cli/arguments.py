@@ -27,8 +27,8 @@ from kineverse.errors import (
 )
 from kineverse.expressions.printing import format_number
 from kineverse.formats.file_formats import is_mjcf
+from kineverse.model.kinematics import infer_units
 from kineverse.model.registry import find_scheme
-from kineverse.view.sliders import infer_units
 
 from .output import format_cells, print_line
 

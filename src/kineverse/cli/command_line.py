@@ -42,7 +42,7 @@ class CommandModule(Protocol):
 COMMANDS: Mapping[str, tuple[str, str]] = MappingProxyType(
     {
         "info": ("info", "print the contents of a model: frames, degrees of freedom, constraints, size"),
-        "fk": ("fk", "print the pose of a frame at given positions"),
+        "fk": ("info:FK", "print the pose of a frame at given positions"),
         "reach": ("reach", "find positions in which a frame has a pose: inverse kinematics"),
         "plan": ("plan", "find a path without collisions"),
         "unlock": ("unlock", "find the order in which locked parts have to move"),
@@ -80,6 +80,7 @@ COMMANDS: Mapping[str, tuple[str, str]] = MappingProxyType(
         "undo": ("exchange:UNDO", "take back a commit of a served model"),
         "dump": ("exchange:DUMP", "write a backup of a served model, or a document of it"),
         "apply": ("exchange:APPLY", "add the operations of a file to a served model"),
+        "cache": ("cache", "print what is kept on the disk to be fast, and remove it"),
         "live": (
             "live_system",
             "let a robot open and close a kitchen, live: world, estimators, behaviour, page",
@@ -140,6 +141,20 @@ def main(argv: Sequence[str] | None = None) -> int:
     -------
     0 on success; 2 if the request cannot be fulfilled, with the reason in one line on standard error; 130
     after Ctrl-C; 141 if the output pipe was closed.
+
+    Examples
+    --------
+    >>> kv.cli.main(["fk", "kitchen", "kitchen/fridge_door_handle", "--set", "kitchen/fridge_door=30deg"])
+    kitchen/fridge_door_handle in world
+         -0.866025           0        -0.5    0.829037
+              -0.5           0    0.866025    -1.41117
+                 0           1           0     1.18425
+                 0           0           0           1
+      position            0.829037    -1.41117     1.18425  m
+      roll pitch yaw        1.5708           0    -2.61799  rad
+      quaternion xyzw     0.183013   -0.683013   -0.683013    0.183013
+      at kitchen/fridge_door=0.523599
+    0
     """
     words = sys.argv[1:] if argv is None else list(argv)
     try:

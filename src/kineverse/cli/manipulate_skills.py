@@ -19,10 +19,10 @@ from kineverse.manipulation import JudgedOutcome, PlacedRobot, Robot, Session, j
 from kineverse.manipulation.articulated_objects import find_shut_value
 from kineverse.manipulation.outcome import Outcome
 from kineverse.manipulation.skill_run import choose_tolerance, explain_fixed
+from kineverse.model.kinematics import infer_units
 from kineverse.model.model import Model
 from kineverse.state import State
 from kineverse.symbols import Symbol
-from kineverse.view.sliders import infer_units
 from kineverse.worlds import RobotInterface, RunMetrics, SimulatedWorld
 
 from .arguments import (

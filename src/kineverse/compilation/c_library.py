@@ -212,6 +212,10 @@ class CompilerInformation:
         ``none``.
     cores
         The number of cores for batches.
+
+    See Also
+    --------
+    kineverse.compilation.compiler_information
     """
 
     compiler: str | None
@@ -223,7 +227,14 @@ class CompilerInformation:
 
 
 def compiler_information() -> CompilerInformation:
-    """Return information on the compiler of this machine; running it takes some milliseconds."""
+    """Return information on the compiler of this machine; running it takes some milliseconds.
+
+    Examples
+    --------
+    >>> information = kv.compilation.compiler_information()
+    >>> information.compiler is None or information.version is not None
+    True
+    """
     found = toolchain()
     return CompilerInformation(
         compiler=found.command[0] if found else None,

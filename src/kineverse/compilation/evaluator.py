@@ -100,6 +100,15 @@ class Evaluator(metaclass=ABCMeta):
         The input vector, shape (n,); zeros at first.
     outputs
         The arrays of results, one per output.
+
+    Examples
+    --------
+    >>> f = kv.compile(kv.load("pr2").fk("pr2/l_gripper_tool_frame"))
+    >>> evaluate = f.bind()
+    >>> evaluate.input[:] = 0.1  # in the order of f.names
+    >>> evaluate()
+    >>> evaluate.outputs[0][:3, 3].round(3)
+    array([0.994, 0.488, 0.734])
     """
 
     __slots__ = ("__weakref__", "_convert", "_references", "_run", "_view", "input", "outputs")

@@ -108,6 +108,17 @@ def compile(  # noqa: A001
         If outputs depend on symbols that are not among the inputs.
     CompileError
         If there is no output, or if tier ``"c"`` is impossible.
+
+    Examples
+    --------
+    >>> model = kv.load("kitchen")
+    >>> f = kv.compile(model.fk("kitchen/fridge_door_handle")[:3, 3])
+    >>> f([0.5]).round(3)
+    array([ 0.842, -1.403,  1.184])
+    >>> f.batch([[0.0], [0.5], [1.0]]).round(3)
+    array([[ 1.137, -1.312,  1.184],
+           [ 0.842, -1.403,  1.184],
+           [ 0.626, -1.626,  1.184]])
     """
     if tier not in ("auto", "interpreter", "c"):
         raise InvalidValueError(f"Unknown tier {tier!r}; tiers are 'auto', 'interpreter' and 'c'.")
@@ -145,6 +156,18 @@ class CompiledFunction(Generic[Results]):
         The shape of every output.
     tier
         The present kind of evaluation: ``"interpreter"`` or ``"c"``.
+
+    Examples
+    --------
+    >>> x, y = kv.position("x"), kv.position("y")
+    >>> f = kv.compile([x * y, kv.array([x, y])])
+    >>> f.names, f.shapes
+    (('x', 'y'), ((), (2,)))
+    >>> product, vector = f([3, 4])
+    >>> product, vector
+    (array(12.), array([3., 4.]))
+    >>> f({"x": 3, "y": 4})[0]
+    array(12.)
     """
 
     __slots__ = (
@@ -237,18 +260,25 @@ class CompiledFunction(Generic[Results]):
         x
             A point per row, shape (N, n).
         out
-            Arrays for the results: contiguous, float64, of shape (N, *shape), one per output (alone if there
-            is a single output). New ones if None.
+            Arrays for the results: contiguous, float64, of shape ``(N, *shape)``, one per output (alone if
+            there is a single output). New ones if None.
 
         Returns
         -------
         numpy.ndarray or tuple of numpy.ndarray
-            An array of shape (N, *shape) per output; for a function of a single expression that array alone.
+            An array of shape ``(N, *shape)`` per output; for a function of one expression that array alone.
 
         Raises
         ------
         ShapeError
             If ``x`` is not an array of n columns of numbers, or ``out`` does not fit.
+
+        Examples
+        --------
+        >>> handle = kv.load("kitchen").fk("kitchen/fridge_door_handle")
+        >>> poses = kv.compile(handle).batch(np.linspace(0, 1.5, 1000).reshape(-1, 1))
+        >>> poses.shape, poses[:, 0, 3].max().round(3)
+        ((1000, 4, 4), np.float64(1.137))
         """
         if self._batch is None:
             from .batch import Batch
@@ -258,7 +288,17 @@ class CompiledFunction(Generic[Results]):
         return results
 
     def bind(self) -> Evaluator:
-        """Return an evaluator for one thread, which writes its results in place."""
+        """Return an evaluator for one thread, which writes its results in place.
+
+        Examples
+        --------
+        >>> x = kv.position("x")
+        >>> evaluate = kv.compile(x**2).bind()
+        >>> evaluate.input[0] = 3
+        >>> evaluate()
+        >>> evaluate.outputs[0]
+        array(9.)
+        """
         size, convert = self._signature.size, self._signature.vector
         with self._lock:
             if self._native is not None:
@@ -282,6 +322,12 @@ class CompiledFunction(Generic[Results]):
         ------
         CompileError
             If C is required (``tier="c"``) and has failed.
+
+        Examples
+        --------
+        >>> f = kv.compile(kv.position("x") ** 2, tier="interpreter")
+        >>> f.wait(), f.tier
+        (False, 'interpreter')
         """
         if self._library is None:
             return False
@@ -369,6 +415,13 @@ class CompiledFunction(Generic[Results]):
         inputs = ", ".join(self.names[:4]) + (", ..." if len(self.names) > 4 else "")
         outputs = ", ".join(map(str, self.shapes[:6])) + (", ..." if len(self.shapes) > 6 else "")
         return f"CompiledFunction({len(self.names)} inputs: {inputs} -> {outputs}; {self.tier})"
+
+    def _repr_html_(self) -> str:
+        from kineverse._rich_display import html_table  # for start-up time
+
+        rows = [("input", str(i), name) for i, name in enumerate(self.names)]
+        rows += [("output", str(i), f"shape {shape}") for i, shape in enumerate(self.shapes)]
+        return html_table(f"compiled function, evaluated by {self.tier}", ("", "number", ""), rows)
 
 
 @dataclass(frozen=True, slots=True)

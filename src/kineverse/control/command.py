@@ -67,6 +67,10 @@ class Command:
         Durations of the parts of the step.
     contacts
         Near pairs of bodies, nearest first; the first of them have rows.
+
+    See Also
+    --------
+    kineverse.control.Controller.step
     """
 
     speeds: Mapping[Symbol, float]

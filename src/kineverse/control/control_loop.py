@@ -74,11 +74,6 @@ def run_control_loop(
     An exception of ``source``, ``until`` or ``on_error``, or one of the controller that is none of this
     package, ends the loop: it is raised once the speeds are zero. One of the sink is raised at once, after
     an attempt to command zeros; so is a second KeyboardInterrupt.
-
-    Examples
-    --------
-    >>> report = run_control_loop(controller, rate=100, source=robot.state, sink=robot.drive, duration=10)
-    >>> report.missed_deadlines, report.step_times.worst
     """
     for name, value in (("rate", rate), ("stale", stale), ("duration", duration)):
         if value is not None and not (isinstance(value, int | float) and 0 < value < math.inf):

@@ -102,6 +102,18 @@ class Controller:
         As :class:`.Formulation`; also for a time step or a weight that is not positive.
     MissingDependencyError
         If the solver is not installed.
+
+    Examples
+    --------
+    >>> model = kv.load("kitchen")
+    >>> door = model.symbol("kitchen/fridge_door")
+    >>> tasks = [kv.control.Goal(door, 1.0)]
+    >>> controller = kv.control.Controller(model, tasks, dt=0.02, tier="interpreter")
+    >>> state = model.default_state()
+    >>> for _ in range(100):
+    ...     state = model.integrate(state, controller.step(state).speeds, controller.dt)
+    >>> round(state[door], 2)
+    0.98
     """
 
     def __init__(
@@ -220,7 +232,12 @@ class Controller:
 
     @one_at_a_time
     def reset(self, speeds: StateLike | None = None) -> None:
-        """Forget the last commands and solutions: the next step starts from some speeds, or from rest."""
+        """Forget the last commands and solutions: the next step starts from some speeds, or from rest.
+
+        See Also
+        --------
+        kineverse.control.Controller.step
+        """
         self._solver.reset()
         self._relaxed.reset()
         known = as_state(speeds or {}, self.speeds)
@@ -240,6 +257,17 @@ class Controller:
             For a parameter that no task of the controller has.
         ShapeError, InvalidValueError
             For a value of another shape, or one that is not finite.
+
+        Examples
+        --------
+        >>> model = kv.load("fetch")
+        >>> hand = model.fk("fetch/gripper_link")[:3, 3]
+        >>> target = kv.control.Target("goal", [0.8, 0.0, 0.9])
+        >>> tasks = [kv.control.Goal(hand, target.expression, name="hand")]
+        >>> controller = kv.control.Controller(model, tasks, dt=0.02, tier="interpreter")
+        >>> controller.set(target, hand(model.default_state()) + [0, 0.1, 0])
+        >>> round(controller.step(model.default_state()).residuals["hand"], 3)
+        0.1
         """
         if isinstance(target, Target):
             self._set_target(target, value)
@@ -320,6 +348,17 @@ class Controller:
             If the program or its solution has a NaN, with the tasks or constraints where it arises.
         UnknownNameError, ShapeError, InvalidValueError
             For a state that lacks a value, or has another length, or a NaN.
+
+        Examples
+        --------
+        >>> model = kv.load("kitchen")
+        >>> goal = kv.control.Goal(model.symbol("kitchen/fridge_door"), 1.0, gain=5, name="open")
+        >>> controller = kv.control.Controller(model, [goal], dt=0.02, tier="interpreter")
+        >>> command = controller.step({"kitchen/fridge_door": 0.2})
+        >>> round(command.speeds[kv.velocity("kitchen/fridge_door")], 3), command.active[0]
+        (1.5, 'kitchen/fridge_door/velocity')
+        >>> command.residuals
+        {'open': 0.8}
         """
         # A collection of the whole program takes many times as long as a step; it has time between steps.
         with self._lock, no_collection():
@@ -413,6 +452,17 @@ class Controller:
             Cycles per second, by default ``1/dt``; another rate sets :attr:`dt`.
         options
             ``stale``, ``acceleration``, ``duration``, ``until``, ``on_error``, ``clock``, ``sleep``.
+
+        Examples
+        --------
+        >>> model = kv.load("kitchen")
+        >>> goal = kv.control.Goal(model.symbol("kitchen/fridge_door"), 1.0, name="open")
+        >>> controller = kv.control.Controller(model, [goal], dt=0.02, tier="interpreter")
+        >>> states = [model.default_state()]
+        >>> drive = lambda speeds: states.append(model.integrate(states[-1], speeds, 0.02))
+        >>> report = controller.run(source=lambda: states[-1], sink=drive, duration=0.1)
+        >>> states[-1]["kitchen/fridge_door"] > 0
+        True
         """
         if rate is not None:
             if not 0 < rate < math.inf:

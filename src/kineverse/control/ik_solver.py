@@ -88,6 +88,17 @@ class InverseKinematics:
         another model.
     MissingDependencyError
         If the solver of quadratic programs is not installed.
+
+    Examples
+    --------
+    >>> model = kv.load("fetch")
+    >>> hand = model.fk("fetch/gripper_link")
+    >>> reach = kv.control.Target("reach", np.eye(4))
+    >>> goal = kv.control.Goal(kv.control.same_pose(reach.expression, hand))
+    >>> solver = kv.control.InverseKinematics(model, [goal], fixed=["fetch/base"])
+    >>> pose = kv.translation(0.7, 0.2, 0.9) @ kv.rpy(0, np.pi / 2, 0)
+    >>> solver.solve(reach.values(pose)).solved
+    True
     """
 
     def __init__(
@@ -152,6 +163,10 @@ class InverseKinematics:
         UnknownNameError, InvalidValueError
             For values of unknown symbols, values that are not finite, less than one start, or a negative
             seed.
+
+        See Also
+        --------
+        kineverse.control.InverseKinematics
         """
         begin = perf_counter()
         starts, solutions = as_count("starts", starts, 1), as_count("solutions", solutions, 1)
@@ -358,6 +373,16 @@ def inverse_kinematics(
         As for :class:`InverseKinematics`.
     values, starts, solutions, seed
         As for :meth:`InverseKinematics.solve`.
+
+    Examples
+    --------
+    >>> model = kv.load("fetch")
+    >>> hand = model.fk("fetch/gripper_link")
+    >>> pose = kv.translation(0.7, 0.2, 0.9) @ kv.rpy(0, np.pi / 2, 0)
+    >>> goal = kv.control.Goal(kv.control.same_pose(pose, hand), name="reach")
+    >>> result = kv.control.inverse_kinematics(model, [goal], fixed=["fetch/base"])
+    >>> result.solved, hand(result.best)[:3, 3].round(4)
+    (True, array([0.7, 0.2, 0.9]))
     """
     solver = InverseKinematics(model, tasks, scene=scene, fixed=fixed, margin=margin, tolerance=tolerance)
     return solver.solve(values, starts=starts, solutions=solutions, seed=seed)
@@ -386,6 +411,10 @@ class IkResult:
         Numbers of starts and of Gauss-Newton steps.
     seconds
         Duration [s].
+
+    See Also
+    --------
+    kineverse.control.inverse_kinematics
     """
 
     solved: bool

@@ -58,6 +58,15 @@ class Goal:
     InvalidValueError
         For an expression that nothing moves, a gain or speed that is not positive, or a negative weight; for
         a goal about speeds that has a speed or rate, or entries without a speed.
+
+    Examples
+    --------
+    >>> model = kv.load("fetch")
+    >>> height = model.fk("fetch/gripper_link")[2, 3]
+    >>> goal = kv.control.Goal(height, 0.9, speed=0.2, name="height")
+    >>> result = kv.control.inverse_kinematics(model, [goal], fixed=["fetch/base"])
+    >>> height(result.best).round(4)
+    np.float64(0.9)
     """
 
     expression: Expression
@@ -119,6 +128,16 @@ class Hold:
     ------
     ExpressionError, ShapeError, InvalidValueError
         As for :class:`Goal`; also for an expression of speeds.
+
+    Examples
+    --------
+    >>> model = kv.load("kitchen")
+    >>> left, right = model.symbol("kitchen/fridge_door"), model.symbol("kitchen/oven_door")
+    >>> together = kv.control.Hold(left - right, name="together")
+    >>> tasks = [together, kv.control.Goal(left, 0.5)]
+    >>> result = kv.control.inverse_kinematics(model, tasks)
+    >>> round(result.best[left], 3), round(result.best[right], 3)
+    (0.5, 0.5)
     """
 
     expression: Expression
@@ -159,6 +178,15 @@ class Keep:
     ------
     ExpressionError, ShapeError, InvalidValueError
         For a text, an expression that is no scalar or depends on no symbol, or an empty range.
+
+    Examples
+    --------
+    >>> model = kv.load("fetch")
+    >>> hand = model.fk("fetch/gripper_link")[:3, 3]
+    >>> tasks = [kv.control.Goal(hand, [0.8, 0, 1.2]), kv.control.Keep(0.3, hand[2], 1.0, name="height")]
+    >>> result = kv.control.inverse_kinematics(model, tasks, fixed=["fetch/base"])
+    >>> result.solved, hand(result.best)[2].round(3)
+    (False, np.float64(1.0))
     """
 
     lower: ExpressionLike
@@ -181,6 +209,7 @@ class Keep:
 
 
 Task: TypeAlias = Goal | Hold | Keep
+"""A task of a controller or of inverse kinematics."""
 
 
 def _describe(name: str, expression: object) -> str:
@@ -262,6 +291,11 @@ class Target:
         The parameters in the shape of the value.
     parameters
         The parameters, row by row.
+
+    See Also
+    --------
+    kineverse.control.InverseKinematics
+    kineverse.control.Controller.set
     """
 
     expression: Expression
@@ -329,12 +363,24 @@ def _is_transform(matrix: npt.NDArray[np.float64]) -> bool:
 
 
 def same_position(a_T: ExpressionLike, b_T: ExpressionLike) -> Expression:
-    """Return the position of b minus that of a in the common frame, shape (3,) [m]."""
+    """Return the position of b minus that of a in the common frame, shape (3,) [m].
+
+    Examples
+    --------
+    >>> kv.control.same_position(kv.translation(1, 0, 0), kv.translation(1, 0.2, 0))()
+    array([0. , 0.2, 0. ])
+    """
     return as_transform(b_T)[:3, 3] - as_transform(a_T)[:3, 3]
 
 
 def same_orientation(a_T: ExpressionLike, b_T: ExpressionLike) -> Expression:
-    """Return the rotation vector of b in a, shape (3,) [rad]; see :func:`.log_so3`."""
+    """Return the rotation vector of b in a, shape (3,) [rad]; see :func:`kineverse.spatial.log_so3`.
+
+    Examples
+    --------
+    >>> kv.control.same_orientation(kv.rotation_z(0.1), kv.rotation_z(0.4))().round(3)
+    array([0. , 0. , 0.3])
+    """
     return log_so3(as_transform(a_T)[:3, :3].T @ as_transform(b_T)[:3, :3])
 
 
@@ -347,6 +393,12 @@ def same_pose(a_T: ExpressionLike, b_T: ExpressionLike) -> Expression:
     ----------
     a_T, b_T
         Poses in a common frame, 4×4 expressions or arrays.
+
+    Examples
+    --------
+    >>> a, b = kv.translation(1, 0, 0), kv.translation(1, 0.2, 0) @ kv.rotation_z(0.5)
+    >>> kv.control.same_pose(a, b)().round(3)
+    array([0. , 0.2, 0. , 0. , 0. , 0.5])
     """
     a_T_b = inverse(a_T) @ as_transform(b_T)
     return as_expression(np.concatenate([a_T_b[:3, 3], log_so3(a_T_b[:3, :3])]))
@@ -368,6 +420,14 @@ def look_at(
         Point in the frame of the pose, shape (3,) [m], away from the camera.
     axis
         Viewing axis in the camera's frame, shape (3,).
+
+    Examples
+    --------
+    >>> model = kv.load("fetch")
+    >>> camera = model.fk("fetch/head_tilt_link")
+    >>> goal = kv.control.Goal(kv.control.look_at(camera, [2.0, 1.0, 0.0]))
+    >>> kv.control.inverse_kinematics(model, [goal], fixed=["fetch/base"]).solved
+    True
     """
     pose = as_transform(camera_T)
     forward = unit_vector(axis, "The viewing axis")

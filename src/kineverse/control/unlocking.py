@@ -134,6 +134,20 @@ def unlock(
     ------
     InvalidValueError
         For no goal, and numbers that are not finite or not positive.
+
+    Examples
+    --------
+    >>> model = kv.Model()
+    >>> with model.edit() as edit:
+    ...     edit.apply(kv.articulations.DoorWithHandle(name="room", parent="world"))
+    'door with handle room'
+    >>> tasks = kv.control.unlock(model, {"room/door": 1.0})
+    >>> controller = kv.control.Controller(model, tasks, dt=0.05, tier="interpreter")
+    >>> state = model.default_state()
+    >>> for _ in range(200):
+    ...     state = model.integrate(state, controller.step(state).speeds, controller.dt)
+    >>> round(state["room/door"], 1)
+    1.0
     """
     for what, number in (("rate", rate), ("margin", margin), ("tolerance", tolerance)):
         if not (finite_number(number) or 0.0) > 0:

@@ -44,6 +44,11 @@ def pose_covariance(position: float, orientation: float) -> Array:
     ------
     InvalidValueError
         If one of them is not a positive finite number.
+
+    Examples
+    --------
+    >>> kv.estimation.pose_covariance(0.01, np.radians(1)).diagonal().round(6)
+    array([0.0001  , 0.0001  , 0.0001  , 0.000305, 0.000305, 0.000305])
     """
     for name, value in (("position", position), ("orientation", orientation)):
         if not (math.isfinite(value) and value > 0.0):
@@ -68,7 +73,7 @@ _ROTATION_VOLUME = 8 * math.pi**2  # volume of SO(3) in rotation vectors [rad³]
 class Outliers:
     """Outlier model: a mixture of the noise density and a uniform density.
 
-    A measurement with the noise density N is an inlier with the probability
+    A measurement with the noise density N is an inlier with the probability::
 
         w = (1 - ε) N / ((1 - ε) N + ε u)
 
@@ -91,6 +96,18 @@ class Outliers:
     ------
     InvalidValueError
         For a fraction that is not between 0 and 1, or a reach or gate that is not positive.
+
+    Examples
+    --------
+    >>> model = kv.load("kitchen")
+    >>> frames = ["kitchen/fridge_door", "kitchen/fridge_door_handle"]
+    >>> tracker = kv.estimation.Tracker(model, frames, outliers=kv.estimation.Outliers(fraction=0.1))
+    >>> poses = {frame: model.fk(frame)({"kitchen/fridge_door": 0.9}) for frame in frames}
+    >>> for _ in range(5):
+    ...     estimate = tracker.update(poses)
+    >>> poses["kitchen/fridge_door"][:3, 3] += 0.5  # a false detection
+    >>> tracker.update(poses).outliers
+    ('kitchen/fridge_door',)
     """
 
     fraction: float = 0.05
@@ -128,7 +145,7 @@ class Outliers:
         square
             Squared norm of its whitened residual.
         log_scale
-            ½ log |2πR|.
+            ½ log det(2πR).
         log_density
             Result of :meth:`log_density`.
 

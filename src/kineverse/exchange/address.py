@@ -220,6 +220,13 @@ def list_servers() -> list[str]:
     """Return the names of the model servers of this user that are running, sorted.
 
     What killed servers have left in the folder is removed.
+
+    Examples
+    --------
+    >>> server = kv.exchange.serve("kitchen", name="doc-list")
+    >>> "doc-list" in kv.exchange.list_servers()
+    True
+    >>> server.close()
     """
     try:
         folder = runtime_folder()

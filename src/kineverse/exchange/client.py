@@ -19,6 +19,7 @@ from typing import Any, TypeVar
 from msgspec.structs import replace
 
 from kineverse._checks import as_count, as_entries, as_tolerance, check_flag
+from kineverse._rich_display import Html, element, join_html
 from kineverse._runtime import Closing
 from kineverse._version import __version__
 from kineverse.errors import ConflictError, EditError, ForbiddenError, OfflineError
@@ -99,6 +100,23 @@ class LiveModel(Model, Closing):
     stored, or raises and nothing has happened. Commits of others arrive in the background. Listeners are
     called in a thread of their own, in order, and may edit. The version is the server's revision. While the
     server is away, reading goes on and edits raise; afterwards the model catches up.
+
+    Examples
+    --------
+    >>> server = kv.exchange.serve("kitchen", name="doc-live")
+    >>> model = kv.load(server.address)  # usually in another process
+    >>> with model.edit() as edit:
+    ...     edit.add_frame("lamp", parent="kitchen/sink_area", transform=kv.translation(0, 0, 1))
+    'frame lamp'
+    >>> "lamp" in server.snapshot().frames
+    True
+    >>> model.close()
+    >>> server.close()
+    >>> with model.edit() as edit:
+    ...     edit.add_frame("bulb", parent="lamp")
+    Traceback (most recent call last):
+        ...
+    kineverse.errors.OfflineError: The connection to live:doc-live was closed, or its model was not ...
     """
 
     def __init__(self, connection: Connection, wish: protocol.JoinRequest) -> None:
@@ -167,6 +185,15 @@ class LiveModel(Model, Closing):
         ------
         ConflictError
             If the last attempt was in conflict as well.
+
+        Examples
+        --------
+        >>> server = kv.exchange.serve("kitchen", name="doc-transact")
+        >>> model = kv.load(server.address)
+        >>> model.transact(lambda edit: edit.write("owner", "Ada"))
+        'data owner'
+        >>> model.close()
+        >>> server.close()
         """
         for done in range(as_count("attempts", attempts, 1)):
             try:
@@ -204,6 +231,19 @@ class LiveModel(Model, Closing):
             If there is no such revision, or this thread edits the model.
         OfflineError
             If the server is away.
+
+        Examples
+        --------
+        >>> server = kv.exchange.serve("kitchen", name="doc-undo")
+        >>> model = kv.load(server.address)
+        >>> with model.edit() as edit:
+        ...     edit.write("owner", "Ada")
+        'data owner'
+        >>> model.undo(model.version)
+        >>> "owner" in model.data
+        False
+        >>> model.close()
+        >>> server.close()
         """
         connection = self.exchange
         wanted = as_count("revision", revision, 1)
@@ -227,6 +267,21 @@ class LiveModel(Model, Closing):
             If this thread edits the model.
         OfflineError
             If the connection was closed, or is meanwhile, and the model does not have the version.
+
+        Examples
+        --------
+        >>> server = kv.exchange.serve("kitchen", name="doc-wait")
+        >>> one, other = kv.load(server.address), kv.load(server.address)
+        >>> with one.edit() as edit:
+        ...     edit.write("owner", "Ada")
+        'data owner'
+        >>> other.wait(one.version, timeout=60)
+        True
+        >>> other.data["owner"]
+        'Ada'
+        >>> one.close()
+        >>> other.close()
+        >>> server.close()
         """
         wanted, connection = as_count("version", version, 0), self.exchange
         self._check_not_edited()
@@ -241,6 +296,12 @@ class LiveModel(Model, Closing):
         if connection.revision < wanted:
             connection.check_open()
         return is_over
+
+    def _repr_html_(self) -> str:
+        connection = self.exchange
+        state = "closed" if connection.is_closed else "online" if connection.is_online else "server away"
+        own = element("p", element("b", str(connection.address)), f": revision {self.version}, {state}")
+        return join_html(own, Html(super()._repr_html_()))
 
     def close(self) -> None:
         """End the connection; reading goes on. A second call has no effect, and a script need not call it."""

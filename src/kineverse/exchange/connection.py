@@ -70,6 +70,17 @@ class Connection:
         False while the server is away.
     sources
         Sources of state that the server has announced.
+
+    Examples
+    --------
+    >>> server = kv.exchange.serve("kitchen", name="doc-connection")
+    >>> model = kv.load(server.address)
+    >>> model.exchange.is_online, model.exchange.revision == model.version
+    (True, True)
+    >>> [row.revision for row in model.exchange.history(most=1)]
+    [1]
+    >>> model.close()
+    >>> server.close()
     """
 
     def __init__(self, address: Address) -> None:

@@ -49,6 +49,10 @@ class Relay(Closing):
         For an address that is none, or rights that cannot be read.
     MissingDependencyError
         Without the extra ``exchange``.
+
+    See Also
+    --------
+    kineverse.exchange.serve
     """
 
     def __init__(self, address: str, *, listen: Iterable[str], keys: str | os.PathLike[str]) -> None:

@@ -107,6 +107,15 @@ def serve(
         For a model or rights that cannot be loaded, or a store that is damaged, in use or of another version.
     MissingDependencyError
         Without the extra ``exchange``.
+
+    Examples
+    --------
+    >>> server = kv.exchange.serve("kitchen", name="doc-kitchen", store="kitchen.kvs")
+    >>> server.address, server.revision
+    ('live:doc-kitchen', 1)
+    >>> server.snapshot()
+    <Snapshot: 54 frames, 23 DoF, 46 constraints (version 1)>
+    >>> server.close()
     """
     check_flag("durable", durable)
     check_flag("insecure", insecure)
@@ -164,6 +173,10 @@ class Server(Closing):
     ----------
     name
         Name; clients load ``live:NAME``.
+
+    See Also
+    --------
+    kineverse.exchange.serve
     """
 
     def __init__(

@@ -89,6 +89,15 @@ class StatePublisher(Closing):
         If a coordinate is given twice, or another process of this computer sends under the same name.
     InvalidValueError
         For a source that cannot have that name, or that has neither a server nor a socket.
+
+    Examples
+    --------
+    >>> server = kv.exchange.serve("kitchen", name="doc-publisher")
+    >>> model = kv.load(server.address)
+    >>> source = model.exchange.publisher("encoders", ["kitchen/fridge_door", "kitchen/oven_door"])
+    >>> source.put([0.5, 0.0], stamp=12.0)
+    >>> model.close()
+    >>> server.close()
     """
 
     def __init__(
@@ -204,7 +213,12 @@ class StatePublisher(Closing):
 
 
 class Newest(NamedTuple):
-    """Newest vector of a source."""
+    """Newest vector of a source.
+
+    See Also
+    --------
+    kineverse.exchange.StateReader
+    """
 
     names: tuple[str, ...]  # of its coordinates
     values: Array  # their values (n,): [m], [rad] and their rates by time
@@ -239,6 +253,21 @@ class StateReader(Closing):
     ------
     DuplicateNameError
         If a coordinate is given twice.
+
+    Examples
+    --------
+    >>> server = kv.exchange.serve("kitchen", name="doc-reader")
+    >>> model = kv.load(server.address)
+    >>> reader = model.exchange.reader()
+    >>> source = model.exchange.publisher("encoders", ["kitchen/fridge_door"])
+    >>> while "encoders" not in reader.age:
+    ...     source.put([0.5])
+    ...     heard = reader.wait(0.05)
+    >>> reader.state["kitchen/fridge_door"]
+    0.5
+    >>> reader.close()
+    >>> model.close()
+    >>> server.close()
     """
 
     def __init__(

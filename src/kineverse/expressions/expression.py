@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from .node import AccessListener, Node
 
 ExpressionLike: TypeAlias = "Expression | float | int | npt.ArrayLike | Sequence[Any]"
+"""What becomes an expression: numbers, arrays, expressions, and nested lists of these."""
 
 NO_NODES: frozenset[Node] = frozenset()
 
@@ -50,6 +51,17 @@ class Expression(ArrayMethods):
     and ``hash`` compare structure and give a plain ``bool``; ``<``, ``>``, ``&``, ``|`` and ``~`` build
     continuous logic (:mod:`kineverse.logic`); and :meth:`gradient` is a mapping from derivative symbols to
     expressions that may be overridden (:meth:`augment`).
+
+    Examples
+    --------
+    >>> q = kv.position("door")
+    >>> p = kv.array([np.cos(q), np.sin(q)]) * 0.4
+    >>> p.shape, p.symbols
+    ((2,), (door,))
+    >>> p({"door": 0.5}).round(3)
+    array([0.351, 0.192])
+    >>> p.gradient()
+    {door:velocity: Expression(2,)[-0.4*sin(door), 0.4*cos(door)]}
     """
 
     __slots__ = ("__weakref__", "_gradients", "_key", "_leaves", "_lowered", "_nodes", "_shape", "_sx")
@@ -168,7 +180,13 @@ class Expression(ArrayMethods):
     # -- rearranging (the other methods of arrays are in ArrayMethods) ---------------------------------------
 
     def reshape(self, *shape: Any) -> Expression:
-        """Return the same elements, in C order, in another shape; one length may be -1."""
+        """Return the same elements, in C order, in another shape; one length may be -1.
+
+        Examples
+        --------
+        >>> kv.array([1, kv.position("x"), 3, 4]).reshape(2, -1)
+        Expression(2, 2)[1, x, 3, 4]
+        """
         wanted = shape[0] if len(shape) == 1 and not isinstance(shape[0], (int, np.integer)) else shape
         try:
             return self._rearranged(layout.indices(self._shape).reshape(wanted))
@@ -330,6 +348,16 @@ class Expression(ArrayMethods):
         heuristic
             True if logic and ``augment(..., heuristic=True)`` contribute their trends. ``False`` takes a
             logic node as locally constant and such an augmentation as absent: only facts remain.
+
+        Examples
+        --------
+        >>> x, y = kv.position("x"), kv.position("y")
+        >>> (x * y).gradient()
+        {x:velocity: y, y:velocity: x}
+        >>> (x < y).gradient()
+        {x:velocity: -1, y:velocity: 1}
+        >>> (x < y).gradient(heuristic=False)
+        {}
         """
         from .gradient import gradient
 
@@ -345,6 +373,12 @@ class Expression(ArrayMethods):
         ExpressionError
             For arguments that are not symbols, for a parameter, which has no derivative, and for speeds in
             place of positions: if no column has an entry, but D(e) has the symbols themselves as keys.
+
+        Examples
+        --------
+        >>> x, y = kv.position("x"), kv.position("y")
+        >>> kv.array([x * y, x + y]).jacobian([x, y])
+        Expression(2, 2)[y, x, 1, 1]
         """
         from .gradient import jacobian
 
@@ -355,6 +389,12 @@ class Expression(ArrayMethods):
 
         Augmentations are ignored and parameters are symbols like any other. A filter's transition matrix is
         one of these.
+
+        Examples
+        --------
+        >>> q, length = kv.position("q"), kv.parameter("length", 0.4)
+        >>> (length * np.cos(q)).partial([length])
+        Expression(1,)[cos(q)]
         """
         from .gradient import partial
 
@@ -370,13 +410,27 @@ class Expression(ArrayMethods):
             such as the speeds of wheels) to expressions that fit this shape.
         heuristic
             Marks the entries as directions to try rather than rates (see :meth:`gradient`).
+
+        Examples
+        --------
+        >>> x, wheel = kv.position("x"), kv.position("wheel")
+        >>> rolled = (2 * x).augment({wheel.derivative(): 0.1})  # a wheel of radius 0.1 m moves it too
+        >>> rolled.gradient()
+        {wheel:velocity: 0.1, x:velocity: 2}
         """
         from .node import augment
 
         return augment(self, gradient, replace=False, heuristic=heuristic)
 
     def with_gradient(self, gradient: Mapping[Symbol, ExpressionLike]) -> Expression:
-        """Return the same value with exactly this gradient."""
+        """Return the same value with exactly this gradient.
+
+        Examples
+        --------
+        >>> x, y = kv.position("x"), kv.position("y")
+        >>> np.sin(x).with_gradient({y.derivative(): 1}).gradient()
+        {y:velocity: 1}
+        """
         from .node import augment
 
         return augment(self, gradient, replace=True, heuristic=False)
@@ -387,6 +441,15 @@ class Expression(ArrayMethods):
         """Return e∘S: symbols replaced by expressions or numbers, gradients by the chain rule.
 
         ``D(e∘S)[w] = Σ_a (D(e)[ȧ]∘S)·D(S(a))[w]`` plus the entries of D(e) that belong to no replaced symbol.
+
+        Examples
+        --------
+        >>> x, q = kv.position("x"), kv.position("q")
+        >>> e = (x**2).substitute({x: 3 * q})
+        >>> e
+        (3*q)**2
+        >>> e.gradient()
+        {q:velocity: 18*q}
         """
         from .substitution import substitute
 
@@ -505,17 +568,10 @@ class Expression(ArrayMethods):
 
         return text(notify_access(self))
 
-    def _repr_latex_(self) -> str | None:
-        from .printing import latex
+    def _repr_latex_(self) -> str:
+        from .printing import expression_latex
 
-        formula = latex(notify_access(self))
-        return None if formula is None else f"$\\displaystyle {formula}$"
-
-    def _repr_html_(self) -> str | None:
-        from .printing import html
-
-        # A notebook prefers HTML to LaTeX, so there is none for expressions that are short enough for LaTeX.
-        return html(self) if self._repr_latex_() is None else None
+        return f"$\\displaystyle {expression_latex(notify_access(self))}$"
 
     # -- numpy ---------------------------------------------------------------------------------------------
 
@@ -574,6 +630,15 @@ def as_expression(value: ExpressionLike) -> Expression:
         For ragged sequences.
     ExpressionError
         For other values that are not numeric.
+
+    Examples
+    --------
+    >>> kv.expressions.as_expression([1, kv.position("x")]).shape
+    (2,)
+    >>> kv.expressions.as_expression([[1, 2], [3]])
+    Traceback (most recent call last):
+        ...
+    kineverse.errors.ShapeError: Ragged array: entries of different shapes side by side.
     """
     if isinstance(value, Expression):
         return value
@@ -629,7 +694,14 @@ def _constant(number: float) -> Expression:
 
 
 def array(values: Any) -> Expression:
-    """Return nested sequences of expressions and numbers as one expression, like ``numpy.array``."""
+    """Return nested sequences of expressions and numbers as one expression, like ``numpy.array``.
+
+    Examples
+    --------
+    >>> q = kv.position("q")
+    >>> kv.array([[np.cos(q), -np.sin(q)], [np.sin(q), np.cos(q)]]) @ np.array([1, 0])
+    Expression(2,)[cos(q), sin(q)]
+    """
     if isinstance(values, Expression):
         return values
     if isinstance(values, np.ndarray) and values.dtype == object:

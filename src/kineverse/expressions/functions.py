@@ -176,6 +176,13 @@ def where(condition: ExpressionLike, if_true: ExpressionLike, if_false: Expressi
 
     A selection, not a blend: NaN in the branch that is not taken does not reach the result or its gradient.
     The gradient carries no trend of the condition.
+
+    Examples
+    --------
+    >>> q = kv.position("q")
+    >>> e = kv.where(q < 1, q, 1 + np.log(q))
+    >>> e({"q": 0.5}), e({"q": np.e})
+    (np.float64(0.5), np.float64(2.0))
     """
     c, a, b = broadcast(as_expression(condition), as_expression(if_true), as_expression(if_false))
     return Select.from_arguments((c, a, b), a.shape)
@@ -185,6 +192,12 @@ def minimum(a: ExpressionLike, b: ExpressionLike) -> Expression:
     """Return the smaller, elementwise; the gradient is that of the smaller one, the mean of both at a tie.
 
     NaN if one of them is NaN, and so is the gradient then; ``np.fmin`` returns the other one.
+
+    Examples
+    --------
+    >>> x = kv.position("x")
+    >>> kv.minimum(kv.array([x, 2 * x]), 3)({"x": 2})
+    array([2., 3.])
     """
     x, y = broadcast(as_expression(a), as_expression(b))
     return Extremum.from_arguments((x, y), x.shape, ("min",))
@@ -194,6 +207,15 @@ def maximum(a: ExpressionLike, b: ExpressionLike) -> Expression:
     """Return the larger, elementwise; the gradient is that of the larger one, the mean of both at a tie.
 
     NaN if one of them is NaN, and so is the gradient then; ``np.fmax`` returns the other one.
+
+    Examples
+    --------
+    >>> x, y = kv.position("x"), kv.position("y")
+    >>> e = kv.maximum(x, y)
+    >>> e({"x": 1, "y": 2})
+    np.float64(2.0)
+    >>> e.gradient()[y.derivative()]({"x": 1, "y": 2})
+    np.float64(1.0)
     """
     x, y = broadcast(as_expression(a), as_expression(b))
     return Extremum.from_arguments((x, y), x.shape, ("max",))
@@ -217,7 +239,16 @@ def _is_number(x: Expression) -> Expression:
 
 
 def clip(x: ExpressionLike, lower: ExpressionLike, upper: ExpressionLike) -> Expression:
-    """Return x limited to [lower, upper], elementwise."""
+    """Return x limited to [lower, upper], elementwise.
+
+    Examples
+    --------
+    >>> x = kv.position("x")
+    >>> kv.clip(x, 0, 1)({"x": 1.7})
+    np.float64(1.0)
+    >>> kv.clip(x, 0, 1).gradient()[x.derivative()]({"x": 1.7})
+    np.float64(0.0)
+    """
     return minimum(maximum(x, lower), upper)
 
 
@@ -225,6 +256,12 @@ def norm(x: ExpressionLike) -> Expression:
     """Return the Euclidean norm over all elements, a scalar; its gradient at the origin is 0.
 
     The squares of elements neither overflow nor vanish: the norm of (3e200, 4e200) is 5e200.
+
+    Examples
+    --------
+    >>> x, y = kv.position("x"), kv.position("y")
+    >>> kv.norm(kv.array([x, y]))({"x": 3, "y": 4})
+    np.float64(5.0)
     """
     vector = as_expression(x).ravel()
     if vector.size == 0:

@@ -34,10 +34,16 @@ class Gradient(Mapping["Symbol", Expression]):
     the numbers of its entries by name.
     """
 
-    __slots__ = ("_about", "_entries")
+    __slots__ = ("_about", "_entries", "_of")
 
-    def __init__(self, entries: Mapping[Symbol, Expression], about: tuple[Symbol, ...] = ()) -> None:
+    def __init__(
+        self,
+        entries: Mapping[Symbol, Expression],
+        about: tuple[Symbol, ...] = (),
+        of: Expression | None = None,
+    ) -> None:
         self._entries, self._about = dict(entries), about
+        self._of = of  # the expression, if some of the entries may be trends
 
     def __getitem__(self, key: Symbol | str) -> Expression:
         entry: Expression | None = self.get(key)
@@ -95,25 +101,35 @@ class Gradient(Mapping["Symbol", Expression]):
 
         return evaluate_mapping(self._entries, self._about, {} if values is None else values, by_name)
 
+    @property
+    def trends(self) -> frozenset[Symbol]:
+        """Speeds whose entries are trends: directions of search, which the exact gradient does not have."""
+        if self._of is None:
+            return frozenset()
+        exact = gradient(self._of, heuristic=False)
+        return frozenset(speed for speed, entry in self._entries.items() if entry != exact.get(speed))
+
     def __reduce__(self) -> Any:
-        return Gradient, (self._entries, self._about)
+        return Gradient, (self._entries, self._about, self._of)
 
     def __repr__(self) -> str:
         from .printing import mapping_text
 
         return mapping_text(self)
 
-    def _repr_html_(self) -> str:
-        from .printing import mapping_html
+    def _repr_latex_(self) -> str:
+        from .printing import gradient_latex
 
-        return mapping_html(self)
+        return f"$\\displaystyle {gradient_latex(self, self.trends)}$"
 
 
 def gradient(expression: Expression, heuristic: bool = True) -> Gradient:
     """Return D(e), see :meth:`Expression.gradient`."""
     known = expression._gradients.get(heuristic)
     if known is None:
-        known = Gradient(_gradient(expression, heuristic), expression.symbols)
+        may_have_trends = heuristic and bool(expression._nodes)
+        of = expression if may_have_trends else None
+        known = Gradient(_gradient(expression, heuristic), expression.symbols, of)
         expression._gradients[heuristic] = known
     result: Gradient = known
     return result
@@ -249,7 +265,14 @@ def stack_columns(columns: list[Expression | None], shape: layout.ArrayShape) ->
 
 
 def total_derivative(expression: Expression, heuristic: bool = False) -> Expression:
-    """Return ``ė = Σ D(e)[v]·v``, of the expression's shape: its rate as a function of the speeds."""
+    """Return ``ė = Σ D(e)[v]·v``, of the expression's shape: its rate as a function of the speeds.
+
+    Examples
+    --------
+    >>> x, y = kv.position("x"), kv.position("y")
+    >>> kv.expressions.total_derivative(x * y)
+    y*x:velocity + x*y:velocity
+    """
     if not expression._shape and not expression._nodes and expression._sx.is_symbolic():
         (symbol,) = expression.symbols  # the most frequent case: a limit on a joint's speed
         return symbol.derivative() if symbol.has_derivative else as_expression(0.0)

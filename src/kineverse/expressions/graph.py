@@ -64,7 +64,13 @@ def node_symbols(node: Node) -> frozenset[Symbol]:
 
 
 def gradient_keys(expression: Expression, heuristic: bool = True) -> frozenset[Symbol]:
-    """Return the keys that D(e) can have, without differentiation."""
+    """Return the keys that D(e) can have, without differentiation.
+
+    Examples
+    --------
+    >>> kv.expressions.gradient_keys(np.sin(kv.position("x")))
+    frozenset({x:velocity})
+    """
     symbols, nodes = leaves(expression)
     keys = {s.derivative() for s in symbols if s.has_derivative}
     for node in topological_order(
@@ -155,7 +161,15 @@ def dense_column(expression: Expression) -> SX:
 
 
 def lower(expressions: Sequence[Expression]) -> list[SX]:
-    """Return each expression as one dense column of its elements in C order, common parts shared."""
+    """Return each expression as one dense column of its elements in C order, common parts shared.
+
+    Examples
+    --------
+    >>> x = kv.position("x")
+    >>> first, second = kv.expressions.lower([x**2, kv.array([[1, x], [2, 3]])])
+    >>> second.shape
+    (4, 1)
+    """
     columns = [dense_column(e) for e in expressions]
     if not columns:
         return []

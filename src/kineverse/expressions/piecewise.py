@@ -43,7 +43,7 @@ def spline(
     everywhere. At ±infinity a spline has its limit, which is the last value, or ±infinity with a slope; a
     periodic spline has no limit and is NaN there.
 
-    Between the knots t_k and t_k+1, at a distance h and with s = x - t_k, it is
+    Between the knots t_k and t_k+1, at a distance h and with s = x - t_k, it is::
 
         y_k + m_k s + (3d - 2m_k - m_k+1) s²/h + (m_k + m_k+1 - 2d) s³/h²,      d = (y_k+1 - y_k)/h
 
@@ -68,6 +68,15 @@ def spline(
     InvalidValueError
         For knots that do not increase, another number of values than of knots, NaN, or a periodic spline with
         different first and last values.
+
+    Examples
+    --------
+    >>> x = kv.position("x")
+    >>> profile = kv.spline(x, knots=[0, 1, 2], values=[0, 0.1, 0])
+    >>> profile({"x": 1}), profile({"x": 5})
+    (np.float64(0.1), np.float64(0.0))
+    >>> profile.gradient()[x.derivative()]({"x": 0.5})
+    np.float64(0.15000000000000002)
     """
     t, y = _numbers(knots, "knot"), _numbers(values, "value")
     _check_knots(t)

@@ -30,6 +30,10 @@ class ConversionCheck(Struct, frozen=True):
     of the larger one, and ``joint`` the joint that moves it. ``wrong`` are the differences above what is
     allowed, by frame, or by the joint of a loop; ``cause`` is the first joint from the root at which they
     appear. ``bounds`` are the guaranteed bounds of approximated frames.
+
+    See Also
+    --------
+    kineverse.formats.check_conversion
     """
 
     engine: str
@@ -93,6 +97,14 @@ def check_conversion(
         If the engine is not installed, with the command that installs it.
     FormatError
         If the engine does not read the file, if it lacks a frame, or if it has a joint that the model lacks.
+
+    Examples
+    --------
+    >>> model = kv.load("kitchen")
+    >>> result = model.save("kitchen.urdf")
+    >>> check = kv.formats.check_conversion(model, "kitchen.urdf", states=5)
+    >>> check.engine, check.ok
+    ('pinocchio', True)
     """
     states = as_count("states", states, 1)
     engine = find_engine(path)(Path(path))

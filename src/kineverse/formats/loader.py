@@ -128,6 +128,16 @@ def load(
         If the file is invalid, with file, line, element and reason; or for an invalid prefix or root.
     InvalidValueError
         If ``loops`` is none of these; or for a part of a file, or options of a file for a live model.
+
+    Examples
+    --------
+    >>> kitchen = kv.load("kitchen")
+    >>> kitchen
+    <Model: 54 frames, 23 DoF, 46 constraints (version 1)>
+    >>> kitchen.fk("kitchen/fridge_door_handle")({"kitchen/fridge_door": 0.5})[:3, 3].round(3)
+    array([ 0.842, -1.403,  1.184])
+    >>> kv.load("kitchen", prefix="left").frames["left/fridge_door"].parent
+    'left/fridge'
     """
     check_prefix(prefix)
     check_loops(loops)

@@ -40,7 +40,13 @@ class Source:
 
 
 def shipped_models() -> tuple[str, ...]:
-    """Return the names of the models that ship with the package."""
+    """Return the names of the models that ship with the package.
+
+    Examples
+    --------
+    >>> kv.shipped_models()
+    ('fetch', 'hsr', 'kitchen', 'pr2', 'shelf_door', 'shelf_drawers')
+    """
     return tuple(sorted(file.stem for file in shipped.FOLDER.glob("*.urdf")))
 
 
@@ -59,6 +65,11 @@ def locate_model(name: str | os.PathLike[str]) -> Source:
         If there is no such model, with similar names and the folders searched; or if there are several.
     FormatError
         If the name is no text or path, or no regular file.
+
+    Examples
+    --------
+    >>> kv.formats.locate_model("kitchen").path.name
+    'kitchen.urdf'
     """
     if not isinstance(name, (str, os.PathLike)):
         are_bytes = isinstance(name, (bytes, bytearray, memoryview))

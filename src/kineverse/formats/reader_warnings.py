@@ -102,7 +102,17 @@ def warn(remarks: Iterable[str]) -> None:
 
 @contextmanager
 def collect_warnings() -> Iterator[list[str]]:
-    """Yield a list that collects the warnings of all readers within the block, with their sources."""
+    """Yield a list that collects the warnings of all readers within the block, with their sources.
+
+    Examples
+    --------
+    >>> with open("door.urdf", "w", encoding="utf-8") as file:
+    ...     size = file.write("<robot name='door'><link name='leaf'><visual/></link></robot>")
+    >>> with kv.formats.collect_warnings() as warnings:
+    ...     model = kv.load("door.urdf")
+    >>> warnings
+    ['door.urdf, line 1, <link name="leaf">: <visual> has no shape and is left out.']
+    """
     heard: list[str] = []
     token = _listeners.set((*_listeners.get(), heard))
     try:

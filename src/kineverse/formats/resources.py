@@ -29,14 +29,28 @@ from .root_folder import NOWHERE
 
 
 class Resolver(Protocol):
-    """Source of files by the digest of their content."""
+    """Source of files by the digest of their content.
+
+    See Also
+    --------
+    kineverse.formats.FolderResolver
+    """
 
     def fetch(self, sha256: str, size: int) -> bytes | None:
         """Return the content with this SHA-256 (64 hexadecimal digits) and size [byte]; None without it."""
 
 
 class FolderResolver:
-    """Resolver of a folder in which the name of each file is the SHA-256 of its content."""
+    """Resolver of a folder in which the name of each file is the SHA-256 of its content.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> Path("meshes").mkdir()
+    >>> resolver = kv.formats.FolderResolver("meshes")
+    >>> kv.formats.add_resolver(resolver)  # meshes of documents are now looked for there, too
+    >>> kv.formats.remove_resolver(resolver)
+    """
 
     def __init__(self, folder: str | Path) -> None:
         self._folder = Path(folder)
@@ -55,12 +69,22 @@ _LONGEST_SUFFIX = 20
 
 
 def add_resolver(resolver: Resolver) -> None:
-    """Register a resolver for this process; the latest is asked first."""
+    """Register a resolver for this process; the latest is asked first.
+
+    See Also
+    --------
+    kineverse.formats.FolderResolver
+    """
     _RESOLVERS.insert(0, resolver)
 
 
 def remove_resolver(resolver: Resolver) -> None:
-    """Remove a resolver; nothing happens if it is not registered."""
+    """Remove a resolver; nothing happens if it is not registered.
+
+    See Also
+    --------
+    kineverse.formats.FolderResolver
+    """
     if resolver in _RESOLVERS:
         _RESOLVERS.remove(resolver)
 

@@ -39,6 +39,14 @@ class Rule(NamedTuple):
         Whether such pairs are checked. True includes pairs that are adjacent or excepted by an earlier rule.
     why
         Reason, for readers.
+
+    Examples
+    --------
+    >>> model = kv.load("fetch")
+    >>> touching = kv.geometry.Rule("fetch/*_finger_link", "fetch/gripper_link", why="they slide")
+    >>> scene = kv.geometry.Scene(model, rules=[touching])
+    >>> scene.checks_pair("fetch/l_gripper_finger_link", "fetch/gripper_link")
+    False
     """
 
     a: str
@@ -82,7 +90,16 @@ def read_rules(model: ModelView) -> tuple[Rule, ...]:
 
 
 def rules_as_data(rules: Iterable[Rule]) -> tuple[tuple[str, str, bool, str], ...]:
-    """Return rules as data for a model: ``edit.write(RULES, rules_as_data(rules))``."""
+    """Return rules as data for a model: ``edit.write(RULES, rules_as_data(rules))``.
+
+    Examples
+    --------
+    >>> rule = kv.geometry.Rule("kitchen/fridge*", "kitchen/oven*", why="far apart")
+    >>> model = kv.load("kitchen")
+    >>> with model.edit() as edit:
+    ...     edit.write(kv.geometry.RULES, kv.geometry.rules_as_data([rule]))
+    'data geometry/rules'
+    """
     return tuple((rule.a, rule.b, rule.check, rule.why) for rule in parse_rules(rules))
 
 

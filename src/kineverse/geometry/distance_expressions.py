@@ -42,6 +42,10 @@ class PairDistance:
     parameters
         (3, 3) symbols: the nearest point of a in a, the nearest point of b in b, and the normal in the world.
         Their default values are those at the state of construction.
+
+    See Also
+    --------
+    kineverse.geometry.Scene.expression
     """
 
     a: str

@@ -236,6 +236,10 @@ class PreparedQuery:
         Largest distance of the results [m].
     per_shape
         True for one result for each pair of collision objects, False for the nearest of each pair of bodies.
+
+    See Also
+    --------
+    kineverse.geometry.Scene.watch
     """
 
     def __init__(

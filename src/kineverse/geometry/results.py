@@ -32,6 +32,10 @@ class DistanceResult:
         (3,) unit vector from a to b, with ``distance == normal @ (point_b - point_a)``, also in penetration.
     shape_a, shape_b
         Index of the nearest shape of each body.
+
+    See Also
+    --------
+    kineverse.geometry.Scene.distance
     """
 
     a: str
@@ -69,6 +73,10 @@ class RayHit:
         Distance from the origin of the ray [m]; 0 if the origin is inside of a shape.
     point, normal
         (3,) the point of the hit [m], and the outward unit normal there; against the ray if it starts inside.
+
+    See Also
+    --------
+    kineverse.geometry.Scene.ray
     """
 
     body: str
@@ -90,6 +98,10 @@ class NearestPoint:
         Signed distance from the surface [m]; negative inside.
     point, normal
         (3,) the nearest point of the surface [m], and the outward unit normal there.
+
+    See Also
+    --------
+    kineverse.geometry.Scene.point
     """
 
     body: str
@@ -125,6 +137,10 @@ class DistanceResults(Sequence[DistanceResult]):
         (K, 2) indices of both bodies in the scene's ``bodies`` at the time of the query.
     object_indices
         (K, 2) indices of both collision objects in the scene: shapes, or hulls of decomposed meshes.
+
+    See Also
+    --------
+    kineverse.geometry.Scene.pairs_within
     """
 
     def __init__(

@@ -72,6 +72,15 @@ class Scene:
         If coal is not installed.
     UnknownNameError
         If a rule, or another argument, names a frame that does not exist.
+
+    Examples
+    --------
+    >>> model = kv.load("kitchen")
+    >>> scene = kv.geometry.Scene(model)
+    >>> scene.update(model.default_state())
+    >>> near = scene.distance("kitchen/fridge_door", "kitchen/sink_area")
+    >>> round(near.distance, 3), near.touches
+    (0.002, False)
     """
 
     def __init__(
@@ -130,13 +139,26 @@ class Scene:
         InvalidValueError
             If a value is NaN, or a pose is not finite or 1e12 m away; the message names the bodies. Then all
             poses stay as they were.
+
+        Examples
+        --------
+        >>> model = kv.load("kitchen")
+        >>> scene = kv.geometry.Scene(model)
+        >>> scene.update(model.default_state() | {"kitchen/fridge_door": 1.0})
+        >>> scene.pose("kitchen/fridge_door")[:3, 3].round(3)
+        array([ 1.169, -1.936,  1.334])
         """
         with self._lock:
             self._world.update(state)
 
     @one_at_a_time
     def pose(self, body: str) -> npt.NDArray[np.float64]:
-        """Return the pose of a body at the last update, world_T_body, (4, 4) [m]."""
+        """Return the pose of a body at the last update, world_T_body, (4, 4) [m].
+
+        See Also
+        --------
+        kineverse.geometry.Scene.update
+        """
         self._world.prepare(())
         return self._world.body_pose(body)
 
@@ -151,6 +173,10 @@ class Scene:
             If one of them has no shapes, or :meth:`update` was not called yet.
         KineverseError
             If one of its shapes cannot be used; the message names body and file.
+
+        See Also
+        --------
+        kineverse.geometry.Scene
         """
         return distance_queries.find_distance(self._world, a, b)
 
@@ -162,6 +188,14 @@ class Scene:
         """Return the distances of a body to all bodies within a radius [m], nearest first.
 
         The body is ``a`` in the results.
+
+        Examples
+        --------
+        >>> model = kv.load("kitchen")
+        >>> scene = kv.geometry.Scene(model)
+        >>> scene.update(model.default_state())
+        >>> scene.distances_to("kitchen/oven_door", radius=0.02)[0].b
+        'kitchen/oven_area'
         """
         return distance_queries.find_distances_to(self._world, body, radius)
 
@@ -169,11 +203,30 @@ class Scene:
         """Return all pairs of bodies within a radius of each other [m], nearest first.
 
         Bounds are carried from one state to the next, so the cost grows with the number of near pairs.
+
+        Examples
+        --------
+        >>> model = kv.load("fetch")
+        >>> scene = kv.geometry.Scene(model)
+        >>> scene.update(model.default_state())
+        >>> near = scene.pairs_within(0.05)
+        >>> near[0].a, near[0].b
+        ('fetch/r_gripper_finger_link', 'fetch/l_gripper_finger_link')
         """
         return distance_queries.find_pairs_within(self._world, radius)
 
     def pairs_between(self, one: str, other: str, radius: float) -> DistanceResults:
-        """Return the pairs within a radius [m] between the subtrees of two frames, nearest first."""
+        """Return the pairs within a radius [m] between the subtrees of two frames, nearest first.
+
+        Examples
+        --------
+        >>> model = kv.load("fetch")
+        >>> tags = model.include("kitchen")
+        >>> scene = kv.geometry.Scene(model)
+        >>> scene.update(model.default_state())
+        >>> [(near.a, near.b) for near in scene.pairs_between("fetch/base_link", "kitchen/kitchen", 1.0)][:1]
+        [('fetch/r_gripper_finger_link', 'kitchen/sink_left_upper_drawer')]
+        """
 
         def choose() -> PairFlags:
             subtrees = (flag_subtree(self.model, self.bodies, frame) for frame in (one, other))
@@ -216,6 +269,17 @@ class Scene:
             If a name or pattern matches no body, or the model has no such symbol.
         InvalidValueError
             If the radius is negative or NaN.
+
+        Examples
+        --------
+        >>> model = kv.load("kitchen")
+        >>> scene = kv.geometry.Scene(model)
+        >>> query = scene.watch("kitchen/fridge_door*", radius=0.05, moving="kitchen/fridge_door")
+        >>> for angle in (0.0, 1.0):
+        ...     scene.update(model.default_state() | {"kitchen/fridge_door": angle})
+        ...     print(len(query()))
+        4
+        2
         """
         names, added = (one, other), parse_known_rules(rules, self.model)
         symbols = None if moving is None else _as_list(moving)
@@ -231,7 +295,16 @@ class Scene:
         return query
 
     def self_pairs(self, frame: str, radius: float) -> DistanceResults:
-        """Return the pairs within a radius [m] inside the subtree of a frame: self-collision."""
+        """Return the pairs within a radius [m] inside the subtree of a frame: self-collision.
+
+        Examples
+        --------
+        >>> model = kv.load("fetch")
+        >>> scene = kv.geometry.Scene(model)
+        >>> scene.update(model.default_state())
+        >>> len(scene.self_pairs("fetch/shoulder_pan_link", radius=0.0))
+        0
+        """
         return self.pairs_between(frame, frame, radius)
 
     def expression(self, a: str, b: str) -> PairDistance:
@@ -239,6 +312,19 @@ class Scene:
 
         At other states, evaluate it with the :meth:`expression_values` of that state. Every call for the same
         pair uses the same symbols; if the model already contains a distance of the pair, those of the model.
+
+        Examples
+        --------
+        >>> model = kv.load("kitchen")
+        >>> scene = kv.geometry.Scene(model)
+        >>> state = model.default_state() | {"kitchen/fridge_door": 0.5}
+        >>> scene.update(state)
+        >>> gap = scene.expression("kitchen/fridge_door_handle", "kitchen/fridge_lower_drawer")
+        >>> gap.expression(state).round(3)
+        np.float64(0.484)
+        >>> rates = gap.expression.gradient()
+        >>> rates[kv.velocity("kitchen/fridge_door")](state).round(3)
+        np.float64(0.368)
         """
         closest, *poses = self._with_poses(a, b)
         if (a, b) not in self._parameters:
@@ -260,7 +346,20 @@ class Scene:
 
     @one_at_a_time
     def first_contact(self, margin: float = 0.0) -> DistanceResult | None:
-        """Return a pair within a margin [m], or None; always the same pair at the same state."""
+        """Return a pair within a margin [m], or None; always the same pair at the same state.
+
+        Examples
+        --------
+        >>> model = kv.load("fetch")
+        >>> tags = model.include("kitchen")
+        >>> scene = kv.geometry.Scene(model)
+        >>> scene.update(model.default_state())
+        >>> scene.first_contact() is None
+        True
+        >>> scene.update(model.default_state() | {"fetch/base/x": 0.8})
+        >>> scene.first_contact().touches
+        True
+        """
         return distance_queries.find_first_contact(self._world, margin)
 
     @property
@@ -309,6 +408,14 @@ class Scene:
         Such are the links of a robot around a joint between them, whose shapes overlap. For parameters,
         errors and the meaning see :meth:`find_never_colliding`. Of a single state, such as the default one,
         these are the pairs that overlap there.
+
+        Examples
+        --------
+        >>> model = kv.load("fetch")
+        >>> scene = kv.geometry.Scene(model)
+        >>> rules = scene.find_always_colliding([model.default_state()])
+        >>> len(kv.geometry.Scene(model, rules=rules).rules) >= len(rules)
+        True
         """
         counts, number = self._count_within(states, margin)
         return self._except(counts == number, f"within {margin:g} m at all of {number} states")
@@ -360,6 +467,15 @@ class Scene:
             (3,) in the world [m]; the direction has any length but 0.
         length
             Length of the ray [m].
+
+        Examples
+        --------
+        >>> model = kv.load("kitchen")
+        >>> scene = kv.geometry.Scene(model)
+        >>> scene.update(model.default_state())
+        >>> hit = scene.ray(origin=[0, -1.6, 1.2], direction=[1, 0, 0])
+        >>> hit.body, round(hit.distance, 3)
+        ('kitchen/fridge_door', 1.137)
         """
         return rays.cast_ray(self._world, origin, direction, length)
 
@@ -369,6 +485,15 @@ class Scene:
 
         If the point is inside of bodies, it is the body in which the point is deepest. Triangles have no
         inside.
+
+        Examples
+        --------
+        >>> model = kv.load("kitchen")
+        >>> scene = kv.geometry.Scene(model)
+        >>> scene.update(model.default_state())
+        >>> nearest = scene.point([0.5, -1.6, 1.2])
+        >>> nearest.body, nearest.inside
+        ('kitchen/fridge_door', False)
         """
         return rays.find_nearest_point(self._world, point, radius)
 
@@ -378,6 +503,12 @@ class Scene:
         """Return the bodies whose pose in the world depends on some symbols, in the order of the model.
 
         A wheel's speed moves the whole robot; the crank of a closed loop moves all dependent links.
+
+        Examples
+        --------
+        >>> model = kv.load("kitchen")
+        >>> kv.geometry.Scene(model).bodies_moved_by("kitchen/fridge_door")
+        ('kitchen/fridge_door', 'kitchen/fridge_door_handle')
         """
         motion = FrameDependence(self.model, _as_list(symbols))
         return tuple(body for body in self.bodies if motion.moves(body))

@@ -32,7 +32,7 @@ class CloseLoop(Operation, document_kind="CloseLoop"):
 
     With ``to_T_frame = (R, p)``, the residual consists of the elements of p [m] and of the axis of R times
     the sine of its angle, ½(R - Rᵀ)^∨ [rad], that ``mask`` names, in axes of ``to``. Where they are zero, the
-    dependent coordinates x are a function of the free ones u,
+    dependent coordinates x are a function of the free ones u::
 
         r(x(u), u) = 0,   ∂x/∂u = -(∂r/∂x)⁻¹ ∂r/∂u,
 
@@ -69,6 +69,10 @@ class CloseLoop(Operation, document_kind="CloseLoop"):
         If mask, coordinates or limits do not fit.
     ModelError
         If the frames are connected rigidly.
+
+    See Also
+    --------
+    kineverse.model.Edit.close_loop
     """
 
     traceable: ClassVar[bool] = False
@@ -266,6 +270,22 @@ class LoopConstraint(Operation, document_kind="LoopConstraint"):
     ------
     ModelError
         If the frames are connected rigidly.
+
+    Examples
+    --------
+    >>> model = kv.Model()
+    >>> with model.edit() as edit:
+    ...     for name in ("left", "right"):
+    ...         edit.apply(kv.Prismatic(name=name, parent="world", child=name))
+    ...     edit.apply(kv.loops.LoopConstraint(name="tie", frame="left", to="right", mask=("x",)))
+    'joint left'
+    'joint right'
+    'loop tie'
+    >>> model.violations({"left": 0.1, "right": 0.3})
+    1 violated
+      tie/x: 0 <= -0.2 <= 0 is off by 0.2
+    >>> model.project({"left": 0.1, "right": 0.3})
+    State({left: 0.2, right: 0.2})
     """
 
     name: str

@@ -50,6 +50,10 @@ class SolvedLoop:
         Minimum over the samples of the smallest singular value of ∂r/∂x over the largest one; 0 is singular.
     worst
         Free coordinates at that minimum.
+
+    See Also
+    --------
+    kineverse.loops.solve_loop
     """
 
     function: ImplicitFunction
@@ -100,6 +104,19 @@ def solve_loop(
         analysis takes too much work.
     InvalidValueError
         If the choice of coordinates does not fit the mobility, or limits are missing.
+
+    Examples
+    --------
+    >>> x, y = kv.position("x"), kv.position("y")
+    >>> loop = kv.loops.solve_loop(
+    ...     "rod",
+    ...     residual=kv.array([x**2 + y**2 - 1]),
+    ...     coordinates=[x, y],
+    ...     home={x: 0.0, y: 1.0},
+    ...     limits={x: (-0.5, 0.5), y: (0.0, 1.0)},
+    ... )
+    >>> loop.free, loop.dependent, loop.mobility
+    ((x,), (y,), 1)
     """
     parameters = tuple(s for s in residual.symbols if not s.has_derivative)
     values = np.array([home[s] for s in coordinates])

@@ -29,6 +29,10 @@ class JudgedOutcome(Outcome):
     ----------
     claimed
         Whether the skill believes that it is done.
+
+    See Also
+    --------
+    kineverse.manipulation.open_object
     """
 
     claimed: bool = False
@@ -110,6 +114,10 @@ def stand_at_handle(
     -------
     bool
         Whether the world was reset.
+
+    See Also
+    --------
+    kineverse.manipulation.open_object
     """
     state = world.state
     opener = Opener.of(session.robot, gripper or session.robot.gripper(), state)

@@ -35,6 +35,10 @@ class Articulation:
     ------
     InvalidValueError
         If the number of homes differs from the number of coordinates.
+
+    See Also
+    --------
+    kineverse.Model.articulations
     """
 
     kind: str

@@ -44,7 +44,12 @@ class SetHome(Operation, document_kind="SetHome", tag="home"):
 
 @dataclass(frozen=True)
 class AddFrame(Operation, document_kind="AddFrame", tag="frame"):
-    """New frame in a parent, with an optional body."""
+    """New frame in a parent, with an optional body.
+
+    See Also
+    --------
+    kineverse.model.Edit.add_frame
+    """
 
     name: str
     frame: Frame
@@ -58,7 +63,12 @@ class AddFrame(Operation, document_kind="AddFrame", tag="frame"):
 
 @dataclass(frozen=True)
 class Constrain(Operation, document_kind="Constrain", tag="constraint"):
-    """New constraint."""
+    """New constraint.
+
+    See Also
+    --------
+    kineverse.model.Edit.constrain
+    """
 
     name: str
     constraint: Constraint
@@ -70,7 +80,12 @@ class Constrain(Operation, document_kind="Constrain", tag="constraint"):
 
 @dataclass(frozen=True)
 class SetRate(Operation, document_kind="SetRate"):
-    """Assignment of the rate of a coordinate as a linear function of speeds."""
+    """Assignment of the rate of a coordinate as a linear function of speeds.
+
+    See Also
+    --------
+    kineverse.model.Edit.set_rate
+    """
 
     coordinate: Symbol
     row: RateRow
@@ -86,7 +101,12 @@ class SetRate(Operation, document_kind="SetRate"):
 
 @dataclass(frozen=True)
 class SetData(Operation, document_kind="Write", tag="data"):
-    """Assignment of a datum."""
+    """Assignment of a datum.
+
+    See Also
+    --------
+    kineverse.model.Edit.write
+    """
 
     name: str
     value: Any
@@ -98,7 +118,12 @@ class SetData(Operation, document_kind="Write", tag="data"):
 
 @dataclass(frozen=True)
 class Attach(Operation, document_kind="Attach"):
-    """Move of an existing frame, with all frames below it, to another parent."""
+    """Move of an existing frame, with all frames below it, to another parent.
+
+    See Also
+    --------
+    kineverse.model.Edit.attach
+    """
 
     name: str
     frame: Frame
@@ -116,7 +141,12 @@ class Attach(Operation, document_kind="Attach"):
 
 @dataclass(frozen=True)
 class Override(Operation, document_kind="Override"):
-    """Operation with permission to overwrite values of earlier ones."""
+    """Operation with permission to overwrite values of earlier ones.
+
+    See Also
+    --------
+    kineverse.model.Edit.apply
+    """
 
     overrides = True
 

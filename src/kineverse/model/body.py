@@ -28,8 +28,15 @@ Rgba: TypeAlias = tuple[Finite, Finite, Finite, Finite]
 _Rows: TypeAlias = Annotated[tuple[Finite, ...], Meta(min_length=12, max_length=12)]
 
 
-class Pose(Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
-    """A constant rigid transform, stored as the 12 numbers of its first three rows."""
+class Pose(Struct, frozen=True, array_like=True, repr_omit_defaults=True, forbid_unknown_fields=True):
+    """A constant rigid transform, stored as the 12 numbers of its first three rows.
+
+    Examples
+    --------
+    >>> pose = kv.model.Pose.from_matrix(kv.translation(1, 2, 3))
+    >>> pose.matrix[:3, 3]
+    array([1., 2., 3.])
+    """
 
     rows: _Rows = (1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0)
 
@@ -66,6 +73,15 @@ class Pose(Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
         ------
         ShapeError, InvalidValueError
             If it is not 4×4, or not rigid.
+
+        Examples
+        --------
+        >>> kv.model.Pose.from_matrix(kv.rotation_z(0.5)).matrix[0, 0].round(3)
+        np.float64(0.878)
+        >>> kv.model.Pose.from_matrix(kv.rotation_z(kv.position("q")))
+        Traceback (most recent call last):
+            ...
+        kineverse.errors.InvalidValueError: A pose is constant, and this transform moves with q.
         """
         if np.shape(matrix) != (4, 4):
             raise ShapeError(f"A pose is made from a 4×4 matrix, not from one of shape {np.shape(matrix)}.")
@@ -100,39 +116,69 @@ class _Geometry(
 
 
 class Box(_Geometry, frozen=True):
-    """A box centred at its origin; ``size`` are the full edge lengths along x, y, z [m]."""
+    """A box centred at its origin; ``size`` are the full edge lengths along x, y, z [m].
+
+    See Also
+    --------
+    kineverse.model.Body
+    """
 
     size: Vector3
 
 
 class Cylinder(_Geometry, frozen=True):
-    """A cylinder around z, centred at its origin; radius and length [m]."""
+    """A cylinder around z, centred at its origin; radius and length [m].
+
+    See Also
+    --------
+    kineverse.model.Body
+    """
 
     radius: Finite
     length: Finite
 
 
 class Capsule(_Geometry, frozen=True):
-    """A capsule around z, centred; ``length`` is that of the cylindrical part [m]."""
+    """A capsule around z, centred; ``length`` is that of the cylindrical part [m].
+
+    See Also
+    --------
+    kineverse.model.Body
+    """
 
     radius: Finite
     length: Finite
 
 
 class Sphere(_Geometry, frozen=True):
-    """A sphere around its origin; radius [m]."""
+    """A sphere around its origin; radius [m].
+
+    See Also
+    --------
+    kineverse.model.Body
+    """
 
     radius: Finite
 
 
 class Ellipsoid(_Geometry, frozen=True):
-    """An ellipsoid around its origin; ``radii`` are the half axes along x, y, z [m]."""
+    """An ellipsoid around its origin; ``radii`` are the half axes along x, y, z [m].
+
+    See Also
+    --------
+    kineverse.model.Body
+    """
 
     radii: Vector3
 
 
 class Cone(_Geometry, frozen=True):
-    """A cone around z, its base at -length/2 and its tip at +length/2; radius of the base and length [m]."""
+    """A cone around z, its base at -length/2 and its tip at +length/2; radius of the base and length [m].
+
+    See Also
+    --------
+    kineverse.model.Body
+    """
 
     radius: Finite
     length: Finite
@@ -147,6 +193,11 @@ class Mesh(_Geometry, frozen=True, eq=False):
     None if a program made the reference, which may open any file. ``content`` is the SHA-256 of the file and
     its size [byte], where they are known. Operations in documents contain only ``uri`` and ``scale``;
     comparisons ignore ``root`` and ``content``.
+
+    Examples
+    --------
+    >>> kv.model.Mesh("package://kitchen/meshes/handle.dae", scale=(0.001, 0.001, 0.001)).uri
+    'package://kitchen/meshes/handle.dae'
     """
 
     uri: str
@@ -176,7 +227,15 @@ Geometry: TypeAlias = Box | Cylinder | Capsule | Sphere | Ellipsoid | Cone | Mes
 
 
 class Shape(Struct, frozen=True, omit_defaults=True, forbid_unknown_fields=True):
-    """Geometry at a pose in the frame of its body; visual shapes have a colour."""
+    """Geometry at a pose in the frame of its body; visual shapes have a colour.
+
+    Examples
+    --------
+    >>> tilted = kv.model.Pose.from_matrix(kv.rotation_x(0.3))
+    >>> shape = kv.model.Shape(kv.model.Cylinder(radius=0.02, length=0.1), origin=tilted)
+    >>> shape.geometry
+    Cylinder(radius=0.02, length=0.1)
+    """
 
     geometry: Geometry
     origin: Pose = field(default_factory=lambda: _IDENTITY)
@@ -189,6 +248,16 @@ class Inertia(Struct, frozen=True, omit_defaults=True, forbid_unknown_fields=Tru
     """Mass [kg] and rotational inertia [kg m²] about the centre of mass, in axes given by ``origin``.
 
     ``tensor`` is (ixx, ixy, ixz, iyy, iyz, izz); ``origin`` places the centre of mass in the body's frame.
+
+    Examples
+    --------
+    >>> inertia = kv.model.Inertia(mass=2.0, tensor=(0.02, 0, 0, 0.02, 0, 0.01))
+    >>> model = kv.Model()
+    >>> with model.edit() as edit:
+    ...     edit.add_frame("crate", parent="world", body=kv.model.Body(inertia=inertia))
+    'frame crate'
+    >>> model.mass()
+    2.0
     """
 
     mass: Finite
@@ -197,7 +266,19 @@ class Inertia(Struct, frozen=True, omit_defaults=True, forbid_unknown_fields=Tru
 
 
 class Body(Struct, frozen=True, omit_defaults=True, forbid_unknown_fields=True):
-    """Rigid body that is attached to one frame."""
+    """Rigid body that is attached to one frame.
+
+    Examples
+    --------
+    >>> box = kv.model.Shape(kv.model.Box((0.4, 0.3, 0.2)))
+    >>> body = kv.model.Body(visuals=(box,), collisions=(box,))
+    >>> model = kv.Model()
+    >>> with model.edit() as edit:
+    ...     edit.add_frame("crate", parent="world", transform=kv.translation(1, 0, 0.1), body=body)
+    'frame crate'
+    >>> model.bodies["crate"].collisions[0].geometry
+    Box(size=(0.4, 0.3, 0.2))
+    """
 
     visuals: tuple[Shape, ...] = ()
     collisions: tuple[Shape, ...] = ()

@@ -17,7 +17,12 @@ from .operation import RATES
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """Structural change of one value; ``before`` is None for an added value, ``after`` for a removed one."""
+    """Structural change of one value; ``before`` is None for an added value, ``after`` for a removed one.
+
+    See Also
+    --------
+    kineverse.model.Diff
+    """
 
     kind: str
     name: str
@@ -65,6 +70,17 @@ class Diff:
         ``changes`` shows if their writes changed. Empty in comparisons of models.
     poses
         Frames with other forward kinematics, among those that a listener follows by ``frames=``.
+
+    Examples
+    --------
+    >>> model = kv.load("kitchen")
+    >>> before = model.snapshot()
+    >>> with model.edit() as edit:
+    ...     edit.constrain("ajar", 0, kv.position("kitchen/fridge_door"), 0.3)
+    'constraint ajar'
+    >>> diff = kv.model.compare_models(before, model)
+    >>> diff.paths, diff.added
+    (('constraints/ajar',), ('constraint ajar',))
     """
 
     version: int
@@ -86,6 +102,20 @@ class Diff:
     def paths(self) -> tuple[str, ...]:
         """The paths of all changes, sorted."""
         return tuple(sorted(c.path for c in self.changes))
+
+    def _repr_html_(self) -> str:
+        from kineverse._rich_display import html_table  # for start-up time
+
+        from .display import format_line
+
+        def line(value: Any) -> str:
+            return "" if value is None else format_line(value)
+
+        rows = [(c.path, line(c.before), line(c.after)) for c in sorted(self.changes, key=lambda c: c.path)]
+        kinds = ("added", "removed", "replaced", "moved", "rerun")
+        rows += [(f"operation {tag}", "", kind) for kind in kinds for tag in getattr(self, kind)]
+        caption = f"{len(self.changes)} changes, version {self.version}"
+        return html_table(caption, ("what", "before", "after"), rows)
 
     @property
     def tags(self) -> frozenset[str]:

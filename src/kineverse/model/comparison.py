@@ -238,6 +238,16 @@ def compare_models(before: Model | Snapshot, after: Model | Snapshot) -> Diff:
     ----------
     before, after
         The models. They need no common history.
+
+    Examples
+    --------
+    >>> model = kv.load("kitchen")
+    >>> other = model.copy()
+    >>> with other.edit() as edit:
+    ...     edit.write("owner", "Ada")
+    'data owner'
+    >>> kv.model.compare_models(model, other).paths
+    ('data/owner',)
     """
     old, new = (model.snapshot() if isinstance(model, Model) else model for model in (before, after))
     entries = {entry.tag: entry for entry in old.entries}
@@ -287,6 +297,16 @@ class ValueDifference:
 
 class ModelComparison:
     """Differences between two models beyond a tolerance."""
+
+    def _repr_html_(self) -> str:
+        from kineverse._rich_display import html_table  # for start-up time
+
+        rows = [
+            (one.sign, one.change.path, ", ".join(part.what for part in one.parts))
+            for one in self.differences
+        ]
+        caption = f"{len(rows)} differences beyond {self.tolerance:g}"
+        return html_table(caption, ("", "what", "parts"), rows)
 
     def __init__(self, before: Model, after: Model, tolerance: float, operations: str = "auto") -> None:
         self.before, self.after, self.tolerance = before, after, tolerance
@@ -417,6 +437,17 @@ class BehaviourComparison:
         Largest distance [m] and angle [rad] of all.
     ranges
         Limits of positions and speeds that differ, each with those ``before`` and ``after``.
+
+    Examples
+    --------
+    >>> model = kv.load("kitchen")
+    >>> other = model.copy()
+    >>> with other.edit() as edit:
+    ...     edit.attach("kitchen/fridge_door_handle", "kitchen/fridge_door", kv.translation(0.1, 0, 0))
+    'attach kitchen/fridge_door_handle to kitchen/fridge_door'
+    >>> comparison = kv.model.BehaviourComparison(model, other)
+    >>> comparison.equal, comparison.apart[0].frame
+    (False, 'kitchen/fridge_door_handle')
     """
 
     def __init__(self, before: ModelView, after: ModelView, tolerance: float = 1e-9) -> None:

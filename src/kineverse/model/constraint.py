@@ -23,6 +23,15 @@ class Constraint:
     """Two-sided inequality between scalars; bounds may be expressions, ±infinity means unbounded.
 
     The symbols of ``expression`` determine its type: a limit on positions, on velocities, or on several.
+
+    Examples
+    --------
+    >>> q = kv.position("door")
+    >>> limit = kv.Constraint.from_expressions(0, q, 1.5)
+    >>> limit.symbols, limit.order
+    ((door,), 0)
+    >>> kv.Constraint.from_expressions(-1, q.derivative(), 1).order
+    1
     """
 
     lower: Expression
@@ -42,6 +51,11 @@ class Constraint:
         InvalidValueError
             If the expression is constant, or constant bounds leave nothing between them, or one is NaN; also
             for a bound with a product of infinity and an expression, which is NaN where that is 0.
+
+        Examples
+        --------
+        >>> kv.Constraint.from_expressions(0, kv.position("a") + kv.position("b"), np.inf)
+        Constraint(lower=0, expression=a + b, upper=inf)
         """
         low, middle, high = as_expression(lower), as_expression(expression), as_expression(upper)
         if low.shape or middle.shape or high.shape:

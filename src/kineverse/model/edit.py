@@ -33,6 +33,17 @@ class Edit:
 
     The end of the block commits the edit. An exception in it restores the model. In the block, the model
     shows the edit so far; other threads wait.
+
+    Examples
+    --------
+    >>> model = kv.load("kitchen")
+    >>> with model.edit() as edit:
+    ...     edit.add_frame("lamp", parent="kitchen/sink_area", transform=kv.translation(0, 0, 1))
+    ...     edit.constrain("kitchen/ajar", 0, kv.position("kitchen/fridge_door"), 0.3)
+    'frame lamp'
+    'constraint kitchen/ajar'
+    >>> model.limits("kitchen/fridge_door")
+    (0.0, 0.3)
     """
 
     def __init__(self, history: History, model: ModelView) -> None:
@@ -65,6 +76,17 @@ class Edit:
             operation that has read the old value, such as :class:`Attach`, may overwrite it as well.
         EditError
             If the operation raises an error that is not of this package. Errors of this package pass.
+
+        Examples
+        --------
+        >>> model = kv.Model()
+        >>> with model.edit() as edit:
+        ...     edit.apply(kv.Prismatic(name="drawer", parent="world", child="drawer", lower=0, upper=0.4))
+        ...     edit.apply(kv.model.SetData("owner", "Ada"), tag="whose it is")
+        'joint drawer'
+        'whose it is'
+        >>> model.history.tags
+        ['joint drawer', 'whose it is']
         """
         check_flag("override", override)
         if override and isinstance(operation, Operation):
@@ -80,6 +102,10 @@ class Edit:
         ------
         DuplicateNameError, UnknownNameError, ModelError
             As :meth:`apply`.
+
+        See Also
+        --------
+        kineverse.formats.entries_from_bytes
         """
         self._check_open().link(entry)
         return entry.tag
@@ -104,6 +130,19 @@ class Edit:
         to_affect
             Tag of an operation, or name of a frame, which stands for its last writer. The new operation is
             inserted directly before it, so that it reads the new values (2022 paper, III-A3).
+
+        Examples
+        --------
+        >>> model = kv.Model()
+        >>> with model.edit() as edit:
+        ...     edit.write("height", 1.0)
+        ...     edit.add_frame("lamp", parent="world")
+        ...     edit.insert(kv.model.SetData("colour", "red"), before="frame lamp")
+        'data height'
+        'frame lamp'
+        'data colour'
+        >>> model.history.tags
+        ['data height', 'data colour', 'frame lamp']
         """
         if sum(x is not None for x in (before, after, to_affect)) != 1:
             raise EditError("Say where to insert: exactly one of before=, after= and to_affect=.")
@@ -119,11 +158,37 @@ class Edit:
         return chosen
 
     def replace(self, tag: str, operation: Operation) -> None:
-        """Replace an operation under its tag; operations that depend on it are applied again."""
+        """Replace an operation under its tag; operations that depend on it are applied again.
+
+        Examples
+        --------
+        >>> model = kv.Model()
+        >>> with model.edit() as edit:
+        ...     edit.apply(kv.Prismatic(name="drawer", parent="world", child="drawer", lower=0, upper=0.4))
+        ...     edit.add_frame("handle", parent="drawer", transform=kv.translation(0.1, 0, 0))
+        'joint drawer'
+        'frame handle'
+        >>> hinge = kv.Revolute(name="door", parent="world", child="drawer", axis=(0, 0, 1))
+        >>> with model.edit() as edit:
+        ...     edit.replace("joint drawer", hinge)
+        >>> model.symbols_of("handle")
+        (door,)
+        """
         self._check_open().replace(tag, operation)
 
     def remove(self, tag: str) -> None:
-        """Remove an operation, with its constraints and all its other writes."""
+        """Remove an operation, with its constraints and all its other writes.
+
+        Examples
+        --------
+        >>> model = kv.load("kitchen")
+        >>> with model.edit() as edit:
+        ...     tag = edit.constrain("ajar", 0, kv.position("kitchen/fridge_door"), 0.3)
+        >>> with model.edit() as edit:
+        ...     edit.remove(tag)
+        >>> "ajar" in model.constraints
+        False
+        """
         self._check_open().remove(tag)
 
     # -- the edit as a value -------------------------------------------------------------------------------
@@ -135,6 +200,10 @@ class Edit:
         ------
         EditError, ModelError
             If the edit would be refused at its end.
+
+        See Also
+        --------
+        kineverse.Model.adopt
         """
         history = self._check_open()
         self._model.rates  # noqa: B018 - settles, and raises for cyclic rates
@@ -151,6 +220,10 @@ class Edit:
         EditError
             If a tag is taken or missing, or something is not of the right type. Names, parents and cycles are
             checked as in any edit.
+
+        See Also
+        --------
+        kineverse.Model.adopt
         """
         adopt(self._check_open(), changes, complete=False)
 
@@ -166,6 +239,17 @@ class Edit:
             If a later edit has changed an operation that this one would change, or the commit is not kept.
         InvalidValueError
             If the version is not an integer.
+
+        Examples
+        --------
+        >>> model = kv.load("kitchen")
+        >>> with model.edit() as edit:
+        ...     edit.write("owner", "Ada")
+        'data owner'
+        >>> with model.edit() as edit:
+        ...     edit.undo(model.version)
+        >>> "owner" in model.data
+        False
         """
         take_back(self._check_open(), version)
 
@@ -179,6 +263,17 @@ class Edit:
                 edit.remove("joint door")
                 changes = edit.net()
                 start.roll_back()
+
+        Examples
+        --------
+        >>> model = kv.load("kitchen")
+        >>> with model.edit() as edit:
+        ...     start = edit.savepoint()
+        ...     edit.write("owner", "Ada")
+        ...     start.roll_back()
+        'data owner'
+        >>> "owner" in model.data, model.version
+        (False, 1)
         """
         return Savepoint(self)
 
@@ -198,6 +293,15 @@ class Edit:
 
         The default is the identity. The name of an existing frame is refused unless ``override`` is given;
         :meth:`attach` moves an existing frame.
+
+        Examples
+        --------
+        >>> model = kv.load("kitchen")
+        >>> with model.edit() as edit:
+        ...     edit.add_frame("magnet", "kitchen/fridge_door", kv.translation(0, -0.2, 0.3))
+        'frame magnet'
+        >>> model.symbols_of("magnet")
+        (kitchen/fridge_door,)
         """
         return self.apply(
             AddFrame(name, Frame.from_transform(parent, transform), body), tag, override=override
@@ -211,7 +315,19 @@ class Edit:
         upper: ExpressionLike,
         tag: str | None = None,
     ) -> str:
-        """Add a constraint ``lower <= expression <= upper``; bounds may be expressions or ±inf."""
+        """Add a constraint ``lower <= expression <= upper``; bounds may be expressions or ±inf.
+
+        Examples
+        --------
+        >>> left, right = kv.position("kitchen/fridge_door"), kv.position("kitchen/oven_door")
+        >>> model = kv.load("kitchen")
+        >>> with model.edit() as edit:
+        ...     edit.constrain("one open at a time", -np.inf, left + right, 1.5)
+        'constraint one open at a time'
+        >>> model.violations({left: 1.0, right: 0.7})
+        1 violated
+          one open at a time: -inf <= 1.7 <= 1.5 is off by 0.2
+        """
         return self.apply(Constrain(name, Constraint.from_expressions(lower, expression, upper)), tag)
 
     def close_loop(
@@ -223,7 +339,31 @@ class Edit:
         tag: str | None = None,
         **options: Any,
     ) -> str:
-        """Close a loop between two frames; see :class:`kineverse.CloseLoop` for the options."""
+        """Close a loop between two frames; see :class:`kineverse.CloseLoop` for the options.
+
+        Examples
+        --------
+        >>> model = kv.Model()
+        >>> with model.edit() as edit:
+        ...     for name, x, length in (("crank", 0.0, 0.4), ("rocker", 1.0, 0.9)):
+        ...         at = kv.translation(x, 0, 0)
+        ...         edit.apply(kv.Revolute(name=name, parent="world", child=name, axis=(0, 0, 1), origin=at))
+        ...         edit.add_frame(f"{name}_end", name, kv.translation(length, 0, 0))
+        ...     edit.apply(kv.Revolute(name="coupler", parent="crank_end", child="coupler", axis=(0, 0, 1)))
+        ...     edit.add_frame("coupler_end", "coupler", kv.translation(1.1, 0, 0))
+        ...     edit.close_loop("coupler_end", "rocker_end", home={"coupler": 1, "rocker": 1.5})
+        'joint crank'
+        'frame crank_end'
+        'joint rocker'
+        'frame rocker_end'
+        'joint coupler'
+        'frame coupler_end'
+        'loop coupler_end to rocker_end'
+        >>> model.degrees_of_freedom
+        (crank,)
+        >>> model.fk("coupler_end")({"crank": 0.5})[:2, 3].round(3)
+        array([1.214, 0.874])
+        """
         name = name or f"{frame} to {to}"
         loop = registry.make_shorthand("close_loop", name=name, frame=frame, to=to, mask=mask, **options)
         return self.apply(loop, tag)
@@ -239,6 +379,18 @@ class Edit:
         """Set the rate of a coordinate to ``Σ expression·speed`` over a row.
 
         A second rate of one coordinate is refused unless ``override`` is given.
+
+        Examples
+        --------
+        >>> x, wheel = kv.position("cart/x"), kv.velocity("cart/wheel")
+        >>> model = kv.Model()
+        >>> with model.edit() as edit:
+        ...     edit.add_frame("cart", parent="world", transform=kv.translation(x, 0, 0))
+        ...     edit.set_rate(x, {wheel: 0.1})  # the radius of the wheel [m]
+        'frame cart'
+        'rate cart/x'
+        >>> model.integrate({"cart/x": 0}, {wheel: 2.0}, dt=1.0)
+        State({cart/x: 0.2})
         """
         return self.apply(SetRate(coordinate, as_row(coordinate, row)), tag, override=override)
 
@@ -249,11 +401,33 @@ class Edit:
         transform: TransformLike | Sequence[TransformLike],
         tag: str | None = None,
     ) -> str:
-        """Attach a frame, with all frames below it, to another parent, as when a gripper grasps an object."""
+        """Attach a frame, with all frames below it, to another parent, as when a gripper grasps an object.
+
+        Examples
+        --------
+        >>> model = kv.load("kitchen")
+        >>> with model.edit() as edit:
+        ...     edit.add_frame("cup", parent="world", transform=kv.translation(1, 0, 1))
+        ...     edit.attach("cup", parent="kitchen/fridge_door", transform=kv.translation(0, 0, 0.2))
+        'frame cup'
+        'attach cup to kitchen/fridge_door'
+        >>> model.frames["cup"].parent
+        'kitchen/fridge_door'
+        """
         return self.apply(Attach(frame, Frame.from_transform(parent, transform)), tag)
 
     def write(self, name: str, value: Any, tag: str | None = None) -> str:
-        """Store an immutable value under ``data``, in place of an earlier one of that name."""
+        """Store an immutable value under ``data``, in place of an earlier one of that name.
+
+        Examples
+        --------
+        >>> model = kv.load("kitchen")
+        >>> with model.edit() as edit:
+        ...     edit.write("kitchen/owner", "Ada")
+        'data kitchen/owner'
+        >>> model.data["kitchen/owner"]
+        'Ada'
+        """
         return self.apply(SetData(name, value), tag)
 
     def include(
@@ -265,7 +439,18 @@ class Edit:
         strict: bool = False,
         loops: LoopTreatment = "solve",
     ) -> list[str]:
-        """Append the operations of a file or shipped model, see :func:`kineverse.load`; return their tags."""
+        """Append the operations of a file or shipped model, see :func:`kineverse.load`; return their tags.
+
+        Examples
+        --------
+        >>> model = kv.Model()
+        >>> with model.edit() as edit:
+        ...     tags = edit.include("kitchen")
+        ...     edit.add_frame("lamp", parent="kitchen/sink_area")
+        'frame lamp'
+        >>> model
+        <Model: 55 frames, 23 DoF, 46 constraints (version 1)>
+        """
         with no_collection():
             try:
                 return registry.include_source(self, source, prefix, root=root, strict=strict, loops=loops)
@@ -298,7 +483,12 @@ class Edit:
 
 
 class Savepoint:
-    """Point of an edit, from :meth:`Edit.savepoint`."""
+    """Point of an edit, from :meth:`Edit.savepoint`.
+
+    See Also
+    --------
+    kineverse.model.Edit.savepoint
+    """
 
     def __init__(self, edit: Edit) -> None:
         self._edit = edit

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from .kinematics import Placement
 
 WORLD = "world"
+"""Name of the root frame."""
 
 TransformLike: TypeAlias = "Expression | Pose | npt.ArrayLike"
 
@@ -36,6 +37,12 @@ class Frame:
     factors
         Transforms whose product is parent_T_frame: constants as :class:`Pose`, others as 4×4 expressions. The
         geometric Jacobian of separate factors is far shorter than that of the multiplied matrix.
+
+    Examples
+    --------
+    >>> frame = kv.model.Frame.from_transform("world", kv.translation(kv.position("drawer"), 0, 0))
+    >>> frame.parent, frame.transform[:3, 3]
+    ('world', Expression(3,)[drawer, 0, 0])
     """
 
     parent: str
@@ -60,6 +67,12 @@ class Frame:
         ------
         InvalidValueError
             If a constant one is not rigid.
+
+        Examples
+        --------
+        >>> factors = [kv.translation(1, 0, 0), kv.rotation_z(kv.position("door"))]
+        >>> len(kv.model.Frame.from_transform("world", factors).factors)
+        2
         """
         if isinstance(transform, Pose):
             return Frame(parent, (transform,))

@@ -61,6 +61,11 @@ def moved_frames(model: ModelView, symbols: Iterable[Symbol | str]) -> dict[Symb
     ----------
     symbols
         Symbols, their names or patterns, such as the speeds of a controller.
+
+    Examples
+    --------
+    >>> kv.model.moved_frames(kv.load("kitchen"), ["kitchen/fridge_door"])
+    {kitchen/fridge_door: ('kitchen/fridge_door', 'kitchen/fridge_door_handle')}
     """
     asked = list(find_symbols(model, symbols))
     known = _known_paths(model)
@@ -106,7 +111,14 @@ def moving_symbols(model: ModelView, symbols: Iterable[Symbol | str]) -> dict[st
 
 
 def count_moved_bodies(model: ModelView, symbols: Iterable[Symbol | str]) -> dict[Symbol, int]:
-    """Return the number of bodies with shapes or inertia that each symbol moves, see :func:`moved_frames`."""
+    """Return the number of bodies with shapes or inertia that each symbol moves, see :func:`moved_frames`.
+
+    Examples
+    --------
+    >>> model = kv.load("pr2")
+    >>> kv.model.count_moved_bodies(model, ["pr2/torso_lift_joint", "pr2/l_wrist_roll_joint"])
+    {pr2/torso_lift_joint: 33, pr2/l_wrist_roll_joint: 7}
+    """
     bodies = {name for name, body in model.bodies.items() if not is_empty_body(body)}
     return {s: len(bodies.intersection(frames)) for s, frames in moved_frames(model, symbols).items()}
 

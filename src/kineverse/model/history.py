@@ -49,6 +49,13 @@ class HistoryEntry:
     """Operation at its place, with the reads and writes of its last run; immutable.
 
     ``blob`` is its form in documents, once it is known.
+
+    Examples
+    --------
+    >>> model = kv.load("kitchen")
+    >>> entry = model.history.entry(model.history.tags[0])
+    >>> entry.tag, entry.operation.default_tag()
+    ('frame kitchen/kitchen', 'frame kitchen/kitchen')
     """
 
     tag: str

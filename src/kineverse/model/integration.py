@@ -73,6 +73,18 @@ class Integrator:
     ------
     UnknownNameError
         If a speed moves none of the symbols, or a row contains a coordinate that is not among the symbols.
+
+    Examples
+    --------
+    >>> model = kv.Model()
+    >>> with model.edit() as edit:
+    ...     edit.apply(kv.articulations.OmniBase(name="base", parent="world", child="base"))
+    'joint base'
+    >>> move = model.integrator()
+    >>> move.symbols, move.speeds
+    ((base/angle, base/x, base/y), (base/angle:velocity, base/x:velocity, base/y:velocity))
+    >>> move(np.zeros(3), np.array([0.5, 0.1, 0.0]), 0.1)
+    array([0.05, 0.01, 0.  ])
     """
 
     def __init__(self, rates: Rates, symbols: Iterable[Symbol], speeds: Iterable[Symbol]) -> None:

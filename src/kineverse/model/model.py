@@ -57,6 +57,24 @@ class Model(ModelView):
             edit.constrain("door/range", 0, kv.position("door"), 1.5)
 
     One thread edits at a time, and readers in other threads wait for it; a :meth:`snapshot` never changes.
+
+    Examples
+    --------
+    >>> model = kv.Model()
+    >>> with model.edit() as edit:
+    ...     edit.add_frame("door", parent="world", transform=kv.rotation_z(kv.position("door")))
+    ...     edit.add_frame("handle", parent="door", transform=kv.translation(0.4, 0, 0))
+    ...     edit.constrain("door/range", 0, kv.position("door"), 1.5)
+    'frame door'
+    'frame handle'
+    'constraint door/range'
+    >>> model
+    <Model: 2 frames, 1 DoF, 1 constraints (version 1)>
+    >>> model.fk("handle")({"door": 0.5})[:3, 3].round(3)
+    array([0.351, 0.192, 0.   ])
+    >>> model.violations({"door": 2})
+    1 violated
+      door/range: 0 <= 2 <= 1.5 is off by 0.5
     """
 
     def __init__(
@@ -107,6 +125,18 @@ class Model(ModelView):
         EditError
             At the end of the block, if operations fail after the edit. The message lists the first ones, and
             the attribute ``failures`` has all.
+
+        Examples
+        --------
+        >>> model = kv.load("kitchen")
+        >>> with model.edit() as edit:
+        ...     edit.add_frame("lamp", parent="world", transform=kv.translation(0, 0, 2))
+        ...     edit.add_frame("bulb", parent="lmap")
+        Traceback (most recent call last):
+            ...
+        kineverse.errors.UnknownNameError: The parent of frame 'bulb' is missing. There is no frame ...
+        >>> "lamp" in model.frames
+        False
         """
         check_flag("strict", strict)
         return EditContext(lambda: self._transaction(lambda _: self._commit()))
@@ -187,6 +217,18 @@ class Model(ModelView):
         EditError
             If the changes do not belong to this model: a tag is taken, an anchor or a parent is missing,
             frames or rates are cyclic, or another operation reads what they change. The model is unchanged.
+
+        Examples
+        --------
+        >>> original = kv.load("kitchen")
+        >>> twin = original.copy()
+        >>> with original.edit() as edit:
+        ...     edit.write("owner", "Ada")
+        ...     changes = edit.net()
+        'data owner'
+        >>> twin.adopt(changes)
+        >>> twin.data["owner"], twin.snapshot() == original.snapshot()
+        ('Ada', True)
         """
         self._adopt(changes)
 
@@ -216,7 +258,16 @@ class Model(ModelView):
         strict: bool = False,
         loops: LoopTreatment = "solve",
     ) -> list[str]:
-        """Include a file or a shipped model in one edit, and return the tags; see :func:`kineverse.load`."""
+        """Include a file or a shipped model in one edit, and return the tags; see :func:`kineverse.load`.
+
+        Examples
+        --------
+        >>> home = kv.Model()
+        >>> tags = home.include("kitchen")
+        >>> tags = home.include("pr2", prefix="robot")
+        >>> home
+        <Model: 92 frames, 45 DoF, 90 constraints (version 2)>
+        """
         with self.edit() as edit:
             return edit.include(source, prefix, root=root, strict=strict, loops=loops)
 
@@ -246,20 +297,52 @@ class Model(ModelView):
         frames
             Frames, or patterns such as ``kitchen/*``, whose forward kinematics are followed: their own frames
             and rates, and those of all frames above them. The diff names those that moved in ``poses``.
+
+        Examples
+        --------
+        >>> model = kv.load("kitchen")
+        >>> listener = model.listen(lambda diff: print(diff.poses), frames=["kitchen/fridge_door_handle"])
+        >>> with model.edit() as edit:
+        ...     tag = edit.write("owner", "Ada")  # of no interest to the listener
+        >>> with model.edit() as edit:
+        ...     edit.attach("kitchen/fridge_door_handle", parent="world", transform=kv.translation(1, 0, 1))
+        'attach kitchen/fridge_door_handle to world'
+        ('kitchen/fridge_door_handle',)
+        >>> listener.close()
         """
         return self._listeners.add(callback, CommitFilter.of(paths, symbols, tags, frames))
 
     # -- copies --------------------------------------------------------------------------------------------
 
     def snapshot(self) -> Snapshot:
-        """Return an immutable snapshot of the model, which can be stored, compared and pickled."""
+        """Return an immutable snapshot of the model, which can be stored, compared and pickled.
+
+        Examples
+        --------
+        >>> model = kv.load("kitchen")
+        >>> before = model.snapshot()
+        >>> with model.edit() as edit:
+        ...     edit.remove(model.history.tags[-1])
+        >>> before.version, model.version, before == model.snapshot()
+        (1, 2, False)
+        """
         with self._lock, no_collection():
             self._settle()
             head = {kind: dict(self._history.ordered(kind)) for kind in self._history.head}
             return Snapshot(head, tuple(self._history.sequence), self._version, self._sources)
 
     def copy(self) -> Model:
-        """Return an independent model with the same operations, without applying them again."""
+        """Return an independent model with the same operations, without applying them again.
+
+        Examples
+        --------
+        >>> model = kv.load("kitchen")
+        >>> other = model.copy()
+        >>> with other.edit() as edit:
+        ...     tag = edit.add_frame("lamp", parent="world")
+        >>> "lamp" in other.frames, "lamp" in model.frames
+        (True, False)
+        """
         # No object made here is garbage, so the collector would only cost time.
         with self._lock, no_collection():
             self._settle()
@@ -275,7 +358,20 @@ class Model(ModelView):
 
 
 class Snapshot(ModelView):
-    """Immutable model at one version, with all queries. Snapshots are equal if all values are equal."""
+    """Immutable model at one version, with all queries. Snapshots are equal if all values are equal.
+
+    Examples
+    --------
+    >>> model = kv.load("kitchen")
+    >>> snapshot = model.snapshot()
+    >>> with model.edit() as edit:
+    ...     edit.write("owner", "Ada")
+    'data owner'
+    >>> snapshot.version, "owner" in snapshot.data
+    (1, False)
+    >>> snapshot.model()
+    <Model: 54 frames, 23 DoF, 46 constraints (version 1)>
+    """
 
     def __init__(
         self,

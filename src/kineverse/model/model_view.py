@@ -82,6 +82,12 @@ class ModelView(SymbolicView):
             True to compare the symbols of bounds as well.
         closure
             True to repeat the search with the symbols of the result until it is closed.
+
+        Examples
+        --------
+        >>> model = kv.load("kitchen")
+        >>> sorted(model.constraints_for(model.fk("kitchen/fridge_door_handle")))
+        ['kitchen/fridge_door/position', 'kitchen/fridge_door/velocity']
         """
         with self._lock:
             self._catch_up()
@@ -130,6 +136,15 @@ class ModelView(SymbolicView):
             value of any symbol of the model.
         DuplicateNameError
             If a symbol has two values, by name and by symbol, or several symbols have one name.
+
+        Examples
+        --------
+        >>> model = kv.load("kitchen")
+        >>> model.violations(model.default_state())
+        none violated
+        >>> model.violations({"kitchen/fridge_door": 2.0})
+        1 violated
+          kitchen/fridge_door/position: 0 <= 2 <= 1.5708 is off by 0.429204
         """
         from .violations import find_violations
 
@@ -152,6 +167,10 @@ class ModelView(SymbolicView):
         symbols
             Symbols of the vector, by default :attr:`symbols`; for constraints on speeds append these.
             Constraints on others are not checked. Parameters that are not given have their own values.
+
+        See Also
+        --------
+        kineverse.model.ConstraintChecker
         """
         with self._lock:
             return self._make_checker(self.symbols if symbols is None else tuple(check_symbols(symbols)))
@@ -188,6 +207,14 @@ class ModelView(SymbolicView):
         values
             A state, or a mapping from symbols or names to numbers. Bounds that cannot be evaluated there are
             ignored.
+
+        Examples
+        --------
+        >>> model = kv.load("kitchen")
+        >>> model.limits("kitchen/fridge_door")
+        (0.0, 1.5707963267948966)
+        >>> model.limits("kitchen/fridge_door:velocity")
+        (-1.5, 1.5)
         """
         with self._lock:
             self._catch_up()
@@ -233,7 +260,13 @@ class ModelView(SymbolicView):
         return lower, upper
 
     def symbol(self, name: str) -> Symbol:
-        """Return the symbol of a name; its coordinate is a free or dependent coordinate of the model."""
+        """Return the symbol of a name; its coordinate is a free or dependent coordinate of the model.
+
+        Examples
+        --------
+        >>> kv.load("kitchen").symbol("kitchen/fridge_door:velocity")
+        kitchen/fridge_door:velocity
+        """
         path, order = parse_symbol_name(name)
         coordinates = (*self.symbols, *self.rates.dependent)
         for known in coordinates:
@@ -254,7 +287,13 @@ class ModelView(SymbolicView):
         )
 
     def degree_of_freedom(self, name: Symbol | str) -> Symbol:
-        """Return the degree of freedom of a name."""
+        """Return the degree of freedom of a name.
+
+        Examples
+        --------
+        >>> kv.load("kitchen").degree_of_freedom("kitchen/fridge_door").derivative()
+        kitchen/fridge_door:velocity
+        """
         known = {str(s): s for s in self.degrees_of_freedom}
         if str(name) not in known:
             raise UnknownNameError(
@@ -268,6 +307,12 @@ class ModelView(SymbolicView):
         Parameters have their own default values. Limits are constraints on a linear function of one symbol,
         such as those of a joint and of a mimic joint. Other constraints, such as those on a sum of two
         symbols, are ignored; see :meth:`violations`.
+
+        Examples
+        --------
+        >>> model = kv.load("kitchen")
+        >>> model.default_state()["kitchen/fridge_door"]
+        0.0
         """
         with self._lock:
             symbols = self.symbols
@@ -363,6 +408,15 @@ class ModelView(SymbolicView):
             For an extra constraint with the name of a constraint of the model.
         InvalidValueError
             For a step, gain or recovery that is not possible, or an extra constraint that is none.
+
+        Examples
+        --------
+        >>> model = kv.load("kitchen")
+        >>> rows = model.velocity_rows(0.02, subject="kitchen/fridge_door")
+        >>> rows.names, rows.speeds
+        (('kitchen/fridge_door/velocity', 'kitchen/fridge_door/position'), (kitchen/fridge_door:velocity,))
+        >>> rows.upper({"kitchen/fridge_door": 1.5}).round(2)
+        array([1.5 , 3.54])
         """
         from .velocity_constraints.velocity_rows import velocity_rows
 
@@ -421,6 +475,13 @@ class ModelView(SymbolicView):
             For a speed that moves no coordinate, or a symbol that is not in the model.
         InvalidValueError
             For NaN or an infinite step, or if coordinates diverge.
+
+        Examples
+        --------
+        >>> model = kv.load("kitchen")
+        >>> state = model.integrate(model.default_state(), {"kitchen/fridge_door:velocity": 0.5}, dt=0.1)
+        >>> state["kitchen/fridge_door"]
+        0.05
         """
         with self._lock:
             self._settle()
@@ -458,6 +519,10 @@ class ModelView(SymbolicView):
             If a symbol is not in the model, or a speed moves none of the symbols.
         DuplicateNameError
             If a symbol is given twice.
+
+        See Also
+        --------
+        kineverse.model.Integrator
         """
         from .integration import Integrator
 
@@ -497,6 +562,10 @@ class ModelView(SymbolicView):
             a loop does not close at the state.
         UnknownNameError
             If a value is missing, or a name is unknown.
+
+        See Also
+        --------
+        kineverse.loops.LoopConstraint
         """
         from .projection import project
 
@@ -543,6 +612,15 @@ class ModelView(SymbolicView):
         FormatError
             If the name has another ending, the file cannot be written, or the format cannot express the
             model.
+
+        Examples
+        --------
+        >>> model = kv.load("kitchen")
+        >>> result = model.save("kitchen.kv.json")
+        >>> kv.load("kitchen.kv.json").version
+        1
+        >>> model.save("kitchen.urdf").remarks[0]
+        "URDF has no spring_stiffness: that of 'kitchen/dishwasher_door' is left out"
         """
         names = (leave_out,) if isinstance(leave_out, str) else leave_out
         save = registry.find_service("save")
@@ -561,18 +639,10 @@ class ModelView(SymbolicView):
         return f"<{type(self).__name__}: {self}>"
 
     def _repr_html_(self) -> str:
-        from html import escape
+        from .display import model_html  # for start-up time
 
         with self._lock:
-            mappings = [self.frames, self.articulations, self.constraints, self.bodies, self.data]
-            parts = [part._repr_html_() for part in mappings if part]  # type: ignore[attr-defined]
-            parts += [self.rates._repr_html_()] if self.rates else []
-        tables = "".join(
-            f"<details><summary>{escape(part.partition('<caption>')[2].partition('</caption>')[0])}</summary>"
-            f"{part}</details>"
-            for part in parts
-        )
-        return f"<div><p>{escape(str(self))}</p>{tables}</div>"
+            return model_html(self)
 
 
 def find_symbols(

@@ -6,6 +6,7 @@ returns :class:`Writes`. The reads are recorded, so the operation is applied aga
 
 from __future__ import annotations
 
+import inspect
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, fields, replace
@@ -31,6 +32,15 @@ KINDS = ("frames", "bodies", "articulations", "constraints", "rates", "data")
 FRAMES, BODIES, ARTICULATIONS, CONSTRAINTS, RATES, DATA = KINDS
 
 
+class _Signature:
+    """Signature of an operation: that of ``__init__``, as ``__new__`` takes anything."""
+
+    def __get__(self, operation: object, owner: type) -> inspect.Signature:
+        found = inspect.signature(owner.__init__)  # type: ignore[misc]
+        _, *parameters = found.parameters.values()
+        return found.replace(parameters=parameters, return_annotation=inspect.Signature.empty)
+
+
 @dataclass(frozen=True)
 class Writes:
     """Values that an operation writes, by name.
@@ -48,6 +58,10 @@ class Writes:
         Bodies by frame, and records for people and exporters.
     data
         Other immutable values that can be compared.
+
+    See Also
+    --------
+    kineverse.Operation
     """
 
     frames: Mapping[str, Frame | tuple[str, TransformLike | Sequence[TransformLike]]] = field(
@@ -163,6 +177,27 @@ class Operation(ABC):
                     frames={self.name: (self.parent, kv.translation(q, 0, 0))},
                     constraints={f"{self.name}/range": (0, q, 1)},
                 )
+
+    Examples
+    --------
+    >>> from dataclasses import dataclass
+    >>> @dataclass(frozen=True)
+    ... class Slide(kv.Operation):
+    ...     name: str
+    ...     parent: str
+    ...
+    ...     def apply(self, model):
+    ...         q = kv.position(self.name)
+    ...         return kv.model.Writes(
+    ...             frames={self.name: (self.parent, kv.translation(q, 0, 0))},
+    ...             constraints={f"{self.name}/range": (0, q, 1)},
+    ...         )
+    >>> model = kv.Model()
+    >>> with model.edit() as edit:
+    ...     edit.apply(Slide("drawer", "world"))
+    'slide drawer'
+    >>> model.fk("drawer")({"drawer": 0.3})[:3, 3]
+    array([0.3, 0. , 0. ])
     """
 
     traceable: ClassVar[bool] = True
@@ -178,6 +213,8 @@ class Operation(ABC):
     """Frozen name of the class in documents, in kinds of articulations and in tags."""
 
     _tag: ClassVar[str]
+
+    __signature__ = _Signature()
 
     def __init_subclass__(cls, *, document_kind: str = "", tag: str = "", **keywords: Any) -> None:
         """Name a class in documents, frozen for those that ship, else its own name; and in default tags."""

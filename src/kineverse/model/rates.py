@@ -273,6 +273,19 @@ class Rates(Mapping[Symbol, Mapping[Symbol, Expression]]):
     ------
     ModelError
         For cyclic rows and cyclic dependent coordinates, with the cycle.
+
+    Examples
+    --------
+    >>> model = kv.Model()
+    >>> with model.edit() as edit:
+    ...     edit.apply(
+    ...         kv.articulations.DifferentialDrive(
+    ...             name="base", parent="world", child="base", radius=0.1, track=0.5
+    ...         )
+    ...     )
+    'joint base'
+    >>> model.rates.row("base/angle")
+    {base/left_wheel:velocity: -0.2, base/right_wheel:velocity: 0.2}
     """
 
     dependent: Mapping[Symbol, Expression]

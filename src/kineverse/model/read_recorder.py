@@ -80,6 +80,10 @@ class ReadRecorder:
     """Model before an operation, with the names of :class:`~kineverse.Model` and recorded reads.
 
     Expressions are in plain coordinates, except those of :meth:`fk` and :meth:`carry`.
+
+    See Also
+    --------
+    kineverse.Operation
     """
 
     def __init__(

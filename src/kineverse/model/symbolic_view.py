@@ -211,7 +211,15 @@ class SymbolicView:
 
     @property
     def articulations(self) -> Mapping[str, Articulation]:
-        """Records of articulations by name."""
+        """Records of articulations by name.
+
+        Examples
+        --------
+        >>> model = kv.load("kitchen")
+        >>> door = model.articulations["kitchen/fridge_door"]
+        >>> door.kind, door.parent, door.coordinates
+        ('revolute', 'kitchen/fridge', (kitchen/fridge_door,))
+        """
         return self._mapping(ARTICULATIONS)
 
     @property
@@ -225,13 +233,26 @@ class SymbolicView:
         return NamedMapping(self, CONSTRAINTS, self._carry_constraint)
 
     def plain_constraints(self) -> dict[str, Constraint]:
-        """Return the constraints by name, as operations wrote them: coordinates are plain symbols."""
+        """Return the constraints by name, as operations wrote them: coordinates are plain symbols.
+
+        Examples
+        --------
+        >>> kv.load("kitchen").plain_constraints()["kitchen/fridge_door/position"]
+        Constraint(lower=0, expression=kitchen/fridge_door, upper=1.5708)
+        """
         with self._lock:
             self._settle()
             return dict(self._head[CONSTRAINTS])
 
     def plain_rates(self) -> dict[Symbol, RateEntry]:
-        """Return the entries of the rate table by coordinate, as operations wrote them."""
+        """Return the entries of the rate table by coordinate, as operations wrote them.
+
+        Examples
+        --------
+        >>> model = kv.load("articulations/differential_drive")
+        >>> list(model.plain_rates())
+        [differential_drive/base/x, differential_drive/base/y, differential_drive/base/angle]
+        """
         with self._lock:
             self._settle()
             return dict(self._head[RATES].values())
@@ -310,7 +331,17 @@ class SymbolicView:
     # -- kinematics ----------------------------------------------------------------------------------------
 
     def fk(self, frame: str, relative_to: str = WORLD) -> Expression:
-        """Return relative_to_T_frame, a 4×4 expression [m], [rad]; coordinates are carried by their rates."""
+        """Return relative_to_T_frame, a 4×4 expression [m], [rad]; coordinates are carried by their rates.
+
+        Examples
+        --------
+        >>> model = kv.load("kitchen")
+        >>> handle = model.fk("kitchen/fridge_door_handle", relative_to="kitchen/fridge")
+        >>> handle.symbols
+        (kitchen/fridge_door,)
+        >>> handle({"kitchen/fridge_door": 0.5})[:3, 3].round(3)
+        array([ 0.358, -0.197,  1.184])
+        """
         with self._lock:
             self._settle()
             known = self._poses.get((frame, relative_to))
@@ -358,6 +389,12 @@ class SymbolicView:
         ------
         UnknownNameError
             If there is no such frame or form, with similar names.
+
+        Examples
+        --------
+        >>> model = kv.load("kitchen")
+        >>> model.jacobian("kitchen/fridge_door_handle")({"kitchen/fridge_door": 0.5}).ravel().round(3)
+        array([-0.533, -0.327,  0.   ,  0.   ,  0.   ,  1.   ])
         """
         if form not in ("world_aligned", "world", "body"):
             raise UnknownNameError(
@@ -406,7 +443,13 @@ class SymbolicView:
         return from_casadi(ca.densify(sx), (6, len(parts)), nodes)
 
     def mass(self, frame: str = WORLD) -> float:
-        """Return the mass [kg] of the bodies at or below a frame, by default of all; 0 without any."""
+        """Return the mass [kg] of the bodies at or below a frame, by default of all; 0 without any.
+
+        Examples
+        --------
+        >>> kv.load("pr2").mass("pr2/l_gripper_palm_link")
+        0.44002914
+        """
         with self._lock:
             self._settle()
             bodies = self._head[BODIES]
@@ -440,7 +483,14 @@ class SymbolicView:
         return frame
 
     def speeds_of(self, frame: str, relative_to: str = WORLD) -> tuple[Symbol, ...]:
-        """Return the free speeds that move a frame, sorted: the columns of :meth:`jacobian`."""
+        """Return the free speeds that move a frame, sorted: the columns of :meth:`jacobian`.
+
+        Examples
+        --------
+        >>> model = kv.load("pr2")
+        >>> model.speeds_of("pr2/l_gripper_tool_frame")[:2]
+        (pr2/base/angle:velocity, pr2/base/x:velocity)
+        """
         with self._lock:
             self._settle()
             base, down = kinematics.branches(frame, relative_to, self._frame)
@@ -465,6 +515,12 @@ class SymbolicView:
         coordinates of a joint in its own order. A dependent coordinate, as of a mimic joint or a closed loop,
         is replaced by those that determine it. Pass them to :func:`kineverse.compile` for input vectors in
         this order instead of sorted by name.
+
+        Examples
+        --------
+        >>> model = kv.load("pr2")
+        >>> model.symbols_of("pr2/l_gripper_tool_frame")[:2]
+        (pr2/base/x, pr2/base/y)
         """
         with self._lock:
             self._settle()

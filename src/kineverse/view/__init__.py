@@ -1,13 +1,10 @@
 """Viewer of models: a page in the browser, and pictures without one.
 
 >>> import kineverse as kv
->>> from kineverse.view import picture, save_picture, view
->>> pixels = picture(kv.load("kitchen"), {"kitchen/fridge_door": 0.8})    # needs numpy only
->>> save_picture("kitchen.png", kv.load("kitchen"))
->>> with view(kv.load("kitchen")) as page:                                # needs the extra "view"
-...     print(page.address)
->>> kv.show(kv.load("kitchen"))                                           # the same, until Ctrl-C
+>>> pixels = kv.view.picture(kv.load("shelf_door"), {"shelf_door/door": 0.8})
+>>> kv.view.save_picture("shelf.png", kv.load("shelf_door"))
 
+:func:`kineverse.show` opens a page in the browser and waits; :func:`view` does neither.
 Pictures are drawn by numpy. The page is served by viser, to this computer alone unless a host is given.
 """
 

@@ -31,12 +31,12 @@ class FoldingDoor(Mechanism, document_kind="FoldingDoor"):
     upper panel rotates about A by the coordinate ``name``, q [rad], 0 when shut. The directions along it and
     outward of it are e1 = (-sin q, -cos q) and e2 = (-cos q, sin q), those of the lower panel f1 and
     f2 = (f1z, -f1x). A point (u, v) of a panel is u along and v outward. With points of the upper panel from
-    A, and of the lower one from the hinge B between them,
+    A, and of the lower one from the hinge B between them::
 
         B = A + (e1, e2)·panel_hinge,      C = B + (f1, f2)·arm_end,      |C - D| = arm
 
     C is the intersection of two circles, about B and about D. With ``c = |arm_end|``, ``d = |D - B|`` and
-    w = (D - B)/d:
+    w = (D - B)/d::
 
         C - B = m w + h (w_z, -w_x),       m = (c² + d² - arm²)/2d,       h = √(c² - m²)
 
@@ -44,7 +44,7 @@ class FoldingDoor(Mechanism, document_kind="FoldingDoor"):
     panel from inside, so h is positive, and the panels hang one below the other at q = 0.
 
     A spring opens the door beyond the angle ``tipping`` and shuts it before. Together with the weight of the
-    panels it exerts on the upper panel the torque
+    panels it exerts on the upper panel the torque::
 
         τ = stiffness (q - tipping)      [N m],
 
@@ -83,6 +83,17 @@ class FoldingDoor(Mechanism, document_kind="FoldingDoor"):
     InvalidValueError
         For lengths that are not positive, or with which the arm does not reach at some angle; for a stiffness
         that is not positive.
+
+    Examples
+    --------
+    >>> model = kv.Model()
+    >>> with model.edit() as edit:
+    ...     edit.apply(kv.articulations.FoldingDoor(name="cupboard", parent="world"))
+    'folding door cupboard'
+    >>> model.fk("cupboard/handle")({"cupboard": 0.92})[[0, 2], 3].round(3)
+    array([-0.45 , -0.131])
+    >>> model.data["cupboard/spring"]({"cupboard": 0.0}).round(2)
+    np.float64(-2.4)
     """
 
     main: ClassVar[str] = "lower_panel"
@@ -213,7 +224,7 @@ def _on(point: Point) -> Pose:
 class GarageDoor(Mechanism, document_kind="GarageDoor"):
     """Garage door: the lower edge moves along a vertical rail, the upper edge along one under the ceiling.
 
-    2022 paper, Eqs. 11-13. With the length l and the angle α, 0 when closed,
+    2022 paper, Eqs. 11-13. With the length l and the angle α, 0 when closed::
 
         base_T_door = translation(0, 0, l (1 - cos α)) · rotation_y(α)
 
@@ -250,6 +261,17 @@ class GarageDoor(Mechanism, document_kind="GarageDoor"):
     InvalidValueError
         For lengths that are not positive, a play that is not below the length, or a catch beyond the bolt's
         limits.
+
+    Examples
+    --------
+    >>> model = kv.Model()
+    >>> with model.edit() as edit:
+    ...     edit.apply(kv.articulations.GarageDoor(name="garage", parent="world"))
+    'garage door garage'
+    >>> model.limits("garage/door:velocity", {"garage/door": 0, "garage/bolt": 0})
+    (0.0, 0.0)
+    >>> model.limits("garage/door:velocity", {"garage/door": 0, "garage/bolt": 0.5})
+    (-1.0, 1.0)
     """
 
     main: ClassVar[str] = "door"

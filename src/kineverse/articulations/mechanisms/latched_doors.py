@@ -110,6 +110,17 @@ class DoorWithHandle(HingedDoor, document_kind="DoorWithHandle"):
     InvalidValueError
         For lengths that are not positive, a door that is not shut at 0, a threshold that the handle does not
         reach, a handle above the door, or a spring that does not lift the handle to 0.
+
+    Examples
+    --------
+    >>> model = kv.Model()
+    >>> with model.edit() as edit:
+    ...     edit.apply(kv.articulations.DoorWithHandle(name="room", parent="world"))
+    'door with handle room'
+    >>> model.limits("room/door:velocity", {"room/door": 0, "room/handle": 0})
+    (-1.5, 0.0)
+    >>> model.limits("room/door:velocity", {"room/door": 0, "room/handle": 0.8})
+    (-1.5, 1.5)
     """
 
     door: Limits = Limits(0.0, 1.9)
@@ -217,6 +228,17 @@ class Latch(SprungDoor, document_kind="Latch"):
     ----------
     bolt
         Limits of b.
+
+    Examples
+    --------
+    >>> model = kv.Model()
+    >>> with model.edit() as edit:
+    ...     edit.apply(kv.articulations.Latch(name="shed", parent="world"))
+    'latch shed'
+    >>> model.limits("shed/door", {"shed/door": 0, "shed/bolt": 0})[1]
+    0.0
+    >>> model.limits("shed/door", {"shed/door": 0, "shed/bolt": 0.012})[1]
+    1.9
     """
 
     sprung: ClassVar[str] = "bolt"
@@ -269,6 +291,16 @@ class Microwave(SprungDoor, document_kind="Microwave"):
     InvalidValueError
         For lengths that are not positive, a button that does not reach the catch, or a spring that does not
         open the door beyond ``play``.
+
+    Examples
+    --------
+    >>> model = kv.Model()
+    >>> with model.edit() as edit:
+    ...     edit.apply(kv.articulations.Microwave(name="oven", parent="world"))
+    'microwave oven'
+    >>> shut = model.default_state()
+    >>> model.limits("oven/door", shut), model.limits("oven/door", shut | {"oven/button": 0.01})
+    ((0.0, 0.0), (0.0, 1.9))
     """
 
     sprung: ClassVar[str] = "button"

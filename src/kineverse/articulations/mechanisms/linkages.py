@@ -35,7 +35,7 @@ HALF_TURN = Pose((1.0, 0.0, 0.0, 0.0, 0.0, -1.0, 0.0, 0.0, 0.0, 0.0, -1.0, 0.0))
 class ScissorLift(Mechanism, document_kind="ScissorLift"):
     """Scissor lift: a platform on n pairs of crossed arms, one on top of the other.
 
-    The coordinate ``name`` is the angle q of the arms above the horizontal [rad]. With arms of length L,
+    The coordinate ``name`` is the angle q of the arms above the horizontal [rad]. With arms of length L::
 
         slider at L cos q,      crossing i = 1 … n at (L/2 cos q, L (i - ½) sin q),      height n L sin q
 
@@ -60,6 +60,15 @@ class ScissorLift(Mechanism, document_kind="ScissorLift"):
     ------
     InvalidValueError
         For lengths that are not positive, a wrong number of stages, or limits beyond flat and upright.
+
+    Examples
+    --------
+    >>> model = kv.Model()
+    >>> with model.edit() as edit:
+    ...     edit.apply(kv.articulations.ScissorLift(name="lift", parent="world", stages=3, arm=1.0))
+    'scissor lift lift'
+    >>> model.fk("lift/platform")({"lift": np.pi / 6})[2, 3].round(3)
+    np.float64(1.5)
     """
 
     main: ClassVar[str] = "platform"
@@ -109,7 +118,7 @@ class DeskLamp(Mechanism, document_kind="DeskLamp"):
     """Desk lamp on two parallelograms, which keep the orientation of its head.
 
     The lower arm leans by α from the vertical and the upper one rises by β from the horizontal. Each has a
-    parallel bar of the same length, so elbow and head do not rotate:
+    parallel bar of the same length, so elbow and head do not rotate::
 
         base_T_elbow = translation(L₁ sin α, 0, L₁ cos α)
         base_T_head  = base_T_elbow · translation(L₂ cos β, 0, L₂ sin β)
@@ -137,6 +146,19 @@ class DeskLamp(Mechanism, document_kind="DeskLamp"):
     ------
     InvalidValueError
         For lengths that are not positive, or limits at which a parallelogram becomes flat.
+
+    Examples
+    --------
+    >>> model = kv.Model()
+    >>> with model.edit() as edit:
+    ...     edit.apply(kv.articulations.DeskLamp(name="lamp", parent="world"))
+    'desk lamp lamp'
+    >>> model.degrees_of_freedom
+    (lamp/lower, lamp/upper)
+    >>> model.fk("lamp/head")({"lamp/lower": 0.4, "lamp/upper": 0.2})[:3, :3].round(9)
+    array([[ 1.,  0.,  0.],
+           [ 0.,  1.,  0.],
+           [-0.,  0.,  1.]])
     """
 
     main: ClassVar[str] = "head"
@@ -190,7 +212,7 @@ class DeskLamp(Mechanism, document_kind="DeskLamp"):
 class PistonAndRod(Mechanism, document_kind="PistonAndRod"):
     """Slider-crank: a crank moves a piston by a rod, over the whole revolution.
 
-    With the angle of the crank ``name``, q [rad], its radius r and the length l > r of the rod:
+    With the angle of the crank ``name``, q [rad], its radius r and the length l > r of the rod::
 
         base_T_crank  = rotation_y(q)                                       (the pin is at r along z)
         base_T_piston = translation(0, 0, r cos q + √(l² - r² sin² q))
@@ -215,6 +237,16 @@ class PistonAndRod(Mechanism, document_kind="PistonAndRod"):
     InvalidValueError
         For lengths that are not positive, or a rod that is not longer than the crank, which cannot complete
         a revolution then.
+
+    Examples
+    --------
+    >>> model = kv.Model()
+    >>> with model.edit() as edit:
+    ...     edit.apply(kv.articulations.PistonAndRod(name="engine", parent="world", crank=0.04, rod=0.12))
+    'piston and rod engine'
+    >>> height = model.fk("engine/piston")[2, 3]
+    >>> height({"engine": 0}).round(3), height({"engine": np.pi}).round(3)
+    (np.float64(0.16), np.float64(0.08))
     """
 
     main: ClassVar[str] = "piston"
@@ -268,7 +300,7 @@ class PedalBin(Mechanism, document_kind="PedalBin"):
     under the bin, and a guided rod slides straight up. The rod has a horizontal slot at either end. In the
     lower one is a pin of the pedal, at distance a from its pivot, which lifts the rod by a sin p. In the
     upper one is a pin of the lid, at distance b from its hinge, which the rod lifts by b sin l, where l is
-    the angle of the lid:
+    the angle of the lid::
 
         l = arcsin(a/b sin p)
 
@@ -291,6 +323,16 @@ class PedalBin(Mechanism, document_kind="PedalBin"):
     ------
     InvalidValueError
         For lengths that are not positive, or an arm that lifts the rod by the lid's lever or more.
+
+    Examples
+    --------
+    >>> model = kv.Model()
+    >>> with model.edit() as edit:
+    ...     edit.apply(kv.articulations.PedalBin(name="bin", parent="world"))
+    'pedal bin bin'
+    >>> lid = kv.spatial.rotation_angle(model.fk("bin/lid"))
+    >>> lid({"bin": 0.1}).round(3), lid({"bin": 0.2}).round(3)
+    (np.float64(0.394), np.float64(0.87))
     """
 
     main: ClassVar[str] = "lid"

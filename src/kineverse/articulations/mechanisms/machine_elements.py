@@ -23,7 +23,7 @@ from .mechanism import DARK, RED, STEEL, YELLOW, Mechanism, MechanismPart, box_s
 class ScrewAndNut(Mechanism, document_kind="ScrewAndNut"):
     """Screw that rotates in a fixed place, and a nut that slides along it without rotation.
 
-    With the angle of the screw ``name``, q [rad], its pitch p and the travel t of the nut:
+    With the angle of the screw ``name``, q [rad], its pitch p and the travel t of the nut::
 
         base_T_screw = rotation_z(q),       base_T_nut = translation(0, 0, s)
         s = t - p q/2π  for p > 0,          s = -p q/2π  for p < 0
@@ -48,6 +48,17 @@ class ScrewAndNut(Mechanism, document_kind="ScrewAndNut"):
     ------
     InvalidValueError
         For a pitch of 0, lengths that are not positive, or a negative velocity.
+
+    Examples
+    --------
+    >>> model = kv.Model()
+    >>> with model.edit() as edit:
+    ...     edit.apply(
+    ...         kv.articulations.ScrewAndNut(name="vice", parent="world", pitch=0.01, travel=0.1)
+    ...     )
+    'screw and nut vice'
+    >>> model.fk("vice/nut")({"vice": 2 * np.pi})[2, 3].round(4)  # one turn
+    np.float64(0.09)
     """
 
     main: ClassVar[str] = "nut"
@@ -119,6 +130,17 @@ class Ratchet(Mechanism, document_kind="Ratchet"):
     InvalidValueError
         For lengths that are not positive, fewer than three teeth, a speed of 0, or a pawl that cannot be
         lifted beyond its release.
+
+    Examples
+    --------
+    >>> model = kv.Model()
+    >>> with model.edit() as edit:
+    ...     edit.apply(kv.articulations.Ratchet(name="winch", parent="world"))
+    'ratchet winch'
+    >>> for pawl in (0.0, 0.3):
+    ...     print(model.limits("winch/wheel:velocity", {"winch/pawl": pawl}))
+    (0.0, 10.0)
+    (-10.0, 10.0)
     """
 
     main: ClassVar[str] = "wheel"
@@ -173,6 +195,8 @@ class Ratchet(Mechanism, document_kind="Ratchet"):
 class Faucet(Mechanism, document_kind="Faucet"):
     """Mixer tap: the lever is lifted for more water and turned for warmer water.
 
+    With the lift l and the turn t::
+
         base_T_lever = translation(0, 0, height) · rotation_z(t) · rotation_y(l)
 
     ================  ======================================================================
@@ -198,6 +222,18 @@ class Faucet(Mechanism, document_kind="Faucet"):
     ------
     InvalidValueError
         For lengths or a flow that are not positive, or ranges that are missing or empty.
+
+    Examples
+    --------
+    >>> model = kv.Model()
+    >>> with model.edit() as edit:
+    ...     edit.apply(kv.articulations.Faucet(name="tap", parent="world"))
+    'faucet tap'
+    >>> lift, turn = model.limits("tap/lift"), model.limits("tap/turn")
+    >>> model.data["tap/hot"]({"tap/turn": turn[1]})
+    np.float64(1.0)
+    >>> model.data["tap/flow"]({"tap/lift": lift[0]})
+    np.float64(0.0)
     """
 
     main: ClassVar[str] = "lever"

@@ -75,7 +75,12 @@ BASE = "base"
 
 
 class MechanismPart(NamedTuple):
-    """Frame of a mechanism: its parent part, the factors of its pose in there, and its shapes."""
+    """Frame of a mechanism: its parent part, the factors of its pose in there, and its shapes.
+
+    See Also
+    --------
+    kineverse.articulations.GarageDoor
+    """
 
     below: str
     place: tuple[TransformLike, ...]
@@ -94,6 +99,11 @@ class Mechanism(PlacedOperation):
     ------
     InvalidValueError
         For limits that contradict each other, and dimensions that are impossible.
+
+    See Also
+    --------
+    kineverse.articulations.GarageDoor
+    kineverse.articulations.FoldingDoor
     """
 
     main: ClassVar[str]

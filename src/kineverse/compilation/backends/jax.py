@@ -62,7 +62,7 @@ def to_jax(
     -------
     callable
         A function of an array of shape (..., n), the n inputs along its last axis. It returns arrays of
-        shape (..., *shape) for an expression of some shape, of the argument's type: float32 or float64.
+        shape ``(..., *shape)`` for an expression of some shape, of the argument's type: float32 or float64.
         Whole numbers count as ``float``. On a CPU float32 is computed in float64. Where a loop does not
         close, results are NaN, and no error is raised.
 
@@ -78,6 +78,14 @@ def to_jax(
         If expressions or their gradients depend on symbols that are not among the inputs.
     CompileError
         If there is no expression, or if C is required and impossible.
+
+    Examples
+    --------
+    >>> import jax
+    >>> x, y = kv.position("x"), kv.position("y")
+    >>> f = kv.to_jax(x * np.sin(y), [x, y], tier="operations")
+    >>> jax.grad(f)(jax.numpy.array([2.0, 0.0]))
+    Array([0., 2.], dtype=float32)
     """
     jax = _import_jax()
     check_tier(tier)

@@ -52,7 +52,7 @@ def to_torch(
     -------
     callable
         A function of a tensor of shape (..., n), the n inputs along its last dimension. It returns tensors of
-        shape (..., *shape) for an expression of some shape, of the argument's type: float32 or float64.
+        shape ``(..., *shape)`` for an expression of some shape, of the argument's type: float32 or float64.
         Whole numbers count as the default type. On the CPU float32 is computed in float64. Where a loop does
         not close, results are NaN, and no error is raised.
 
@@ -68,6 +68,16 @@ def to_torch(
         If expressions or their gradients depend on symbols that are not among the inputs.
     CompileError
         If there is no expression, or if C is required and impossible.
+
+    Examples
+    --------
+    >>> import torch
+    >>> x, y = kv.position("x"), kv.position("y")
+    >>> f = kv.to_torch(x * np.sin(y), [x, y], tier="operations")
+    >>> point = torch.tensor([2.0, 0.0], requires_grad=True)
+    >>> f(point).backward()
+    >>> point.grad
+    tensor([0., 2.])
     """
     torch = _import_torch()
     check_tier(tier)

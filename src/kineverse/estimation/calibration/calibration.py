@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from kineverse._checks import as_count, as_positive
+from kineverse._rich_display import TableDisplay, element, html_table
 from kineverse.errors import DuplicateNameError, InvalidValueError, UnknownNameError, list_some, suggest
 from kineverse.estimation.noise import Outliers, as_outliers
 from kineverse.formats.saver import save_corrections
@@ -89,7 +90,7 @@ _PREPARED: WeakKeyDictionary[Model, tuple[int, dict[tuple[Any, ...], _Prepared]]
 
 
 @dataclass(frozen=True, eq=False)
-class Calibration:
+class Calibration(TableDisplay):
     """Result of :func:`calibrate`: parameters, their uncertainty, and the corrected operations.
 
     Attributes
@@ -117,6 +118,10 @@ class Calibration:
         left out, each in one of several parts, by the model from the others.
     looks
         Number of looks.
+
+    See Also
+    --------
+    kineverse.estimation.calibrate
     """
 
     state: State
@@ -218,6 +223,18 @@ class Calibration:
         lines += [f"not told by the data: {format_direction(d)}" for d in self.unobservable if len(d) > 1]
         return "\n".join(lines)
 
+    def _repr_html_(self) -> str:
+        rows = [
+            (str(s), _format(value, self.deviations[str(s)], self.units[str(s)]))
+            for s, value in self.state.items()
+        ]
+        caption, *rest = str(self).splitlines()
+        return element(
+            "div",
+            html_table(caption, ("parameter", "value"), rows),
+            *(element("p", line) for line in rest[len(rows) :]),
+        )
+
 
 def format_direction(direction: Mapping[str, float]) -> str:
     """Return an unobservable direction as text, the largest coefficient first."""
@@ -286,6 +303,21 @@ def calibrate(
         For observations of the wrong shape.
     NoSolutionError
         If the steps do not converge.
+
+    Examples
+    --------
+    >>> model = kv.load("kitchen")
+    >>> door = model.fk("kitchen/fridge_door")
+    >>> seen = {q: door({"kitchen/fridge_door": q + 0.05}) for q in (0.1, 0.5, 0.9)}  # its zero is off
+    >>> looks = [
+    ...     kv.estimation.Look({"kitchen/fridge_door": q}, {"kitchen/fridge_door": pose})
+    ...     for q, pose in seen.items()
+    ... ]
+    >>> result = kv.estimation.calibrate(
+    ...     model, looks, "offsets kitchen/fridge_door", noise=(0.001, 0.01), held_out=0
+    ... )
+    >>> round(result.state["kitchen/fridge_door/offset"], 4)
+    0.05
     """
     if not isinstance(model, Model):
         raise InvalidValueError(f"A model is calibrated, as from kv.load(...), not {model!r:.60}.")

@@ -56,6 +56,10 @@ class LookTable:
         Names of columns without meaning.
     remarks
         Doubts about the table.
+
+    See Also
+    --------
+    kineverse.estimation.read_looks
     """
 
     looks: tuple[Look, ...]
@@ -104,6 +108,16 @@ def read_looks(
         If the table cannot be read, or its meaning is ambiguous. The message names the line or the option.
     UnknownNameError
         If no column is a joint of the model, or a frame is none of it.
+
+    Examples
+    --------
+    >>> model = kv.load("kitchen")
+    >>> rows = ["fridge_door[deg],x[mm],y[mm],z[mm]", "0,10,20,30", "30,11,21,31"]
+    >>> with open("looks.csv", "w", encoding="utf-8") as file:
+    ...     size = file.write(chr(10).join(rows))
+    >>> table = kv.estimation.read_looks("looks.csv", model, observed="kitchen/fridge_door_handle")
+    >>> len(table.looks), table.looks[1].state
+    (2, {kitchen/fridge_door: 0.5235987755982988})
     """
     table = open_table(source)
     reader = _LookReader(table, model, columns, units)

@@ -68,6 +68,18 @@ class ObservedPixel:
         (f_x, f_y) and (c_x, c_y) [px], numbers, or parameters that can be free.
     covariance
         2×2 [px²], or the two variances; estimated from the data by default.
+
+    Examples
+    --------
+    >>> model = kv.load("fetch")
+    >>> pixel = kv.estimation.ObservedPixel(
+    ...     "fetch/gripper_link",
+    ...     camera="fetch/head_camera_rgb_optical_frame",
+    ...     pixel=(312.0, 240.5),
+    ...     focal=(550, 550),
+    ...     centre=(320, 240),
+    ... )
+    >>> look = kv.estimation.Look(model.default_state(), [pixel])  # for calibrate()
     """
 
     frame: str
@@ -98,6 +110,10 @@ class Look:
         reference); any value by :class:`ObservedPose`, :class:`ObservedPosition` or
         :class:`ObservedExpression`, which follows its own parameters only and no corrections. Or a list of
         such pairs, and of :class:`ObservedPixel`.
+
+    See Also
+    --------
+    kineverse.estimation.calibrate
     """
 
     state: StateLike
@@ -105,7 +121,12 @@ class Look:
 
 
 class NoiseGroup(NamedTuple):
-    """Rows of a residual with one size of noise."""
+    """Rows of a residual with one size of noise.
+
+    See Also
+    --------
+    kineverse.estimation.calibrate
+    """
 
     name: str  # groups of one name have the same size in all blocks
     unit: str  # m, rad or px
@@ -114,7 +135,12 @@ class NoiseGroup(NamedTuple):
 
 
 class ResidualBlock(Protocol):
-    """Residuals of N observations of one kind, as a function of the free parameters."""
+    """Residuals of N observations of one kind, as a function of the free parameters.
+
+    See Also
+    --------
+    kineverse.estimation.calibrate
+    """
 
     @property
     def label(self) -> str:
@@ -155,7 +181,12 @@ class ResidualBlock(Protocol):
 
 @runtime_checkable
 class BlockSource(Protocol):
-    """Recording that makes a residual block of its own, such as odometry."""
+    """Recording that makes a residual block of its own, such as odometry.
+
+    See Also
+    --------
+    kineverse.estimation.WheelOdometry
+    """
 
     def residual_block(self, model: ModelView, free: Sequence[Symbol], look: int) -> ResidualBlock:
         """Return the block.

@@ -75,6 +75,15 @@ class WheelOdometry:
     restart
         Longest time [s] after which the start is estimated anew, for wheels that slip all the time a little;
         None if they do not.
+
+    Examples
+    --------
+    >>> times = np.linspace(0, 1, 21)
+    >>> wheels = {"fetch/base/left_wheel": 2 * times, "fetch/base/right_wheel": 2 * times}
+    >>> poses = [kv.translation(0.06 * 2 * t, 0, 0)() for t in times[::10]]
+    >>> drive = kv.estimation.WheelOdometry("fetch/base", times, wheels, times[::10], poses)
+    >>> drive.base  # a recording for calibrate(model, [drive], "wheels fetch/base")
+    'fetch/base'
     """
 
     base: str

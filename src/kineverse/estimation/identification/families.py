@@ -235,6 +235,10 @@ class FamilyParameter(NamedTuple):
         Standard deviation of the prior.
     lower, upper
         Bounds.
+
+    See Also
+    --------
+    kineverse.estimation.Family
     """
 
     start: float
@@ -265,6 +269,21 @@ class Family:
     ShapeError, UnknownNameError, InvalidValueError
         If the transform is not (4, 4), has symbols that are neither joints nor parameters, a deviation is not
         positive, or a range is empty.
+
+    Examples
+    --------
+    >>> q, radius = kv.position("q"), kv.position("radius")
+    >>> cam = kv.estimation.Family(
+    ...     "wheel",
+    ...     kv.rotation_z(q) @ kv.translation(radius, 0, 0),
+    ...     joints={q: (-np.pi, np.pi)},
+    ...     parameters={radius: (0.3, 0.1)},
+    ... )
+    >>> angles = np.linspace(0, 1, 20)
+    >>> poses = np.stack([(kv.rotation_z(a) @ kv.translation(0.4, 0, 0))() for a in angles])
+    >>> result = kv.estimation.identify(None, poses, noise=(0.001, 0.01), families=[cam, "prismatic"])
+    >>> result.best.family, round(result.best.parameters["radius"], 2)
+    ('wheel', 0.4)
     """
 
     name: str

@@ -83,6 +83,18 @@ def identify(
     ------
     ShapeError, InvalidValueError
         For invalid poses or covariances, see :func:`.observations.check_observations`.
+
+    Examples
+    --------
+    >>> hinge = kv.rotation_z(kv.position("q")) @ kv.translation(0.5, 0, 0)
+    >>> poses = np.stack([hinge({"q": q}) for q in np.linspace(0, 1, 12)])
+    >>> result = kv.estimation.identify(None, poses, noise=(0.001, 0.01))
+    >>> result.best.family, result.best.parameters["axis"].round(3) + 0.0
+    ('revolute', array([0., 0., 1.]))
+    >>> model = kv.Model()
+    >>> with model.edit() as edit:
+    ...     edit.apply(result.best.operation("door", parent="world"))
+    'joint door'
     """
     weights = family_weights(families)
     parent_covariance, child_covariance, stated = resolve_noise(

@@ -11,6 +11,7 @@ from typing import TypeVar
 import numpy as np
 import numpy.typing as npt
 
+from kineverse._rich_display import TableDisplay, html_table
 from kineverse.articulations import Fixed, Floating
 from kineverse.errors import DuplicateNameError, InvalidValueError, ModelError
 from kineverse.estimation.identification.curve import CURVE
@@ -292,6 +293,10 @@ class RigidBody:
         Poses of the parts in the first, (4, 4), by name.
     probability
         Probability that the parts form one body.
+
+    See Also
+    --------
+    kineverse.estimation.identify_graph
     """
 
     parts: tuple[str, ...]
@@ -361,6 +366,10 @@ class KinematicEdge:
     closure
         Closure of a loop in a model. None for the joints of the tree, and for a loop that cannot be closed,
         such as one with dependent coordinates of a ball.
+
+    See Also
+    --------
+    kineverse.estimation.identify_graph
     """
 
     parent: str
@@ -384,7 +393,7 @@ class KinematicEdge:
 
 
 @dataclass(frozen=True)
-class KinematicGraph:
+class KinematicGraph(TableDisplay):
     """Rigid bodies and the joints between them.
 
     Attributes
@@ -403,6 +412,10 @@ class KinematicGraph:
         or were never observed together are left out.
     points
         Parts that were observed as points.
+
+    See Also
+    --------
+    kineverse.estimation.identify_graph
     """
 
     bodies: tuple[RigidBody, ...]
@@ -476,6 +489,15 @@ class KinematicGraph:
         lines += [f"{root} is connected to nothing" for root in self.roots[1:]]
         return "\n".join(lines)
 
+    def _repr_html_(self) -> str:
+        rows = [
+            (edge.parent, edge.child, str(edge.result), f"{edge.probability:.1%}", "loop" if closes else "")
+            for edges, closes in ((self.edges, False), (self.loops, True))
+            for edge in edges
+        ]
+        caption = f"{len(self.bodies)} bodies, {len(self.edges)} joints, {len(self.loops)} loops"
+        return html_table(caption, ("parent", "child", "joint", "connection", ""), rows)
+
 
 @singularity_named()
 def identify_graph(
@@ -512,6 +534,17 @@ def identify_graph(
         For invalid poses or covariances, fewer than two parts, points only, and a part without covariance.
     DuplicateNameError
         For a part named ``world`` in addition to the world.
+
+    Examples
+    --------
+    >>> q = np.linspace(0, 1, 12)
+    >>> door = np.stack([(kv.rotation_z(a) @ kv.translation(0.5, 0, 0))() for a in q])
+    >>> drawer = np.stack([kv.translation(1 + 0.3 * a, 0, 0)() for a in q])
+    >>> graph = kv.estimation.identify_graph({"door": door, "drawer": drawer}, noise=(0.001, 0.01))
+    >>> [(edge.parent, edge.child, edge.fit.family) for edge in graph.edges]
+    [('world', 'door', 'revolute'), ('world', 'drawer', 'prismatic')]
+    >>> graph.model()
+    <Model: 4 frames, 1 DoF, 2 constraints (version 1)>
     """
     tracks = check_tracks(poses, noise, points=True)
     if world:

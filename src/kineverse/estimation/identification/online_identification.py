@@ -118,6 +118,15 @@ class Identifier:
         after an eighth more of them.
     sequential
         True if the poses arrive in temporal order, see :func:`.identify`.
+
+    Examples
+    --------
+    >>> hinge = kv.rotation_z(kv.position("q")) @ kv.translation(0.5, 0, 0)
+    >>> identifier = kv.estimation.Identifier(noise=(0.001, 0.01), families=["revolute", "prismatic"])
+    >>> for q in np.linspace(0, 1, 12):
+    ...     identifier.add(None, hinge({"q": q}))
+    >>> identifier.result.best.family
+    'revolute'
     """
 
     def __init__(

@@ -98,6 +98,16 @@ def check_plausibility(
         For invalid poses, covariances or times, and if a covariance is missing.
     ImplausibleError
         If ``strict``, and a joint does not explain the observations.
+
+    Examples
+    --------
+    >>> model = kv.load("shelf_door")
+    >>> slide = np.stack([kv.translation(0, 0.02 * k, 0)() for k in range(30)])  # it is a drawer
+    >>> report = kv.estimation.check_plausibility(model, {"shelf_door/door": slide}, noise=(0.002, 0.01))
+    >>> [verdict.tag for verdict in report.implausible]
+    ['joint shelf_door/door']
+    >>> report.repair(model)
+    ('joint shelf_door/door',)
     """
     checked: object = model.model if isinstance(model, Tracker) else model
     checked = checked.model() if isinstance(checked, Snapshot) else checked
@@ -262,6 +272,16 @@ class PlausibilityMonitor:
         As in :func:`~kineverse.estimation.check_plausibility`.
     keep
         Number of recent observations that reports use.
+
+    Examples
+    --------
+    >>> model = kv.load("shelf_door")
+    >>> monitor = kv.estimation.PlausibilityMonitor(model, ["shelf_door/door"], noise=(0.002, 0.01))
+    >>> door = model.fk("shelf_door/door")
+    >>> for q in np.linspace(0, 1, 10):
+    ...     rejected = monitor.update({"shelf_door/door": door({"shelf_door/door": q})})
+    >>> rejected
+    ()
     """
 
     def __init__(

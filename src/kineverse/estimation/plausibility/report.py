@@ -94,12 +94,22 @@ def find_testable_joints(model: Model, observed: Iterable[str], relative_to: str
 
 
 class ImplausibleError(ModelError):
-    """Joints of a model do not explain the observations."""
+    """Joints of a model do not explain the observations.
+
+    See Also
+    --------
+    kineverse.estimation.check_plausibility
+    """
 
 
 @dataclass(frozen=True)
 class JointVerdict:
-    """Verdict on one joint."""
+    """Verdict on one joint.
+
+    See Also
+    --------
+    kineverse.estimation.check_plausibility
+    """
 
     joint: TestableJoint
     # Of the joint as "served", the same displaced ("elsewhere"), a "rigid" connection, a "free" child, and
@@ -147,7 +157,12 @@ class JointVerdict:
 
 @dataclass(frozen=True)
 class Plausibility:
-    """Verdicts on all testable joints."""
+    """Verdicts on all testable joints.
+
+    See Also
+    --------
+    kineverse.estimation.check_plausibility
+    """
 
     verdicts: tuple[JointVerdict, ...]  # for each pair of frames; a second frame of a part is another pair
     untested: Mapping[str, str]  # observed frames that test no single operation, with the reason in words

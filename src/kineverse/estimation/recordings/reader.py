@@ -66,6 +66,18 @@ def read_recording(
     ------
     FormatError
         If the table cannot be read, or its meaning is ambiguous. The message names the line or the option.
+
+    Examples
+    --------
+    >>> rows = ["time,part,x,y,z"]
+    >>> for k in range(20):
+    ...     rows.append(f"{0.1 * k},drawer,{0.02 * k},0,0.5")
+    >>> with open("poses.csv", "w", encoding="utf-8") as file:
+    ...     size = file.write(chr(10).join(rows))
+    >>> recording = kv.estimation.recordings.read_recording("poses.csv")
+    >>> pair = recording.pair("world", "drawer")
+    >>> pair.relative.shape
+    (20, 3)
     """
     table = open_table(source)
     names = columns.split(",") if isinstance(columns, str) else columns

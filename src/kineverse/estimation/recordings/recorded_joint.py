@@ -59,7 +59,12 @@ _AS_SMOOTH, _SMOOTHER = 1.5, 3.0
 
 @dataclass(frozen=True)
 class ObservationNoise:
-    """Assumed noise of the observations."""
+    """Assumed noise of the observations.
+
+    See Also
+    --------
+    kineverse.estimation.recordings.identify_recorded_joint
+    """
 
     position: float  # standard deviation of each coordinate [m]
     orientation: float | None  # and about each axis [rad]; None if only positions are observed
@@ -78,7 +83,12 @@ class ObservationNoise:
 
 @dataclass(frozen=True, eq=False)
 class Assumption:
-    """Noise and autocorrelation time of the errors, and the joint that is identified with these."""
+    """Noise and autocorrelation time of the errors, and the joint that is identified with these.
+
+    See Also
+    --------
+    kineverse.estimation.recordings.identify_recorded_joint
+    """
 
     noise: ObservationNoise  # of single observations
     correlation_time: float  # autocorrelation time of their errors, in rows
@@ -87,7 +97,12 @@ class Assumption:
 
 @dataclass(frozen=True, eq=False)
 class RecordedJoint(Assumption):
-    """Joint identified from a recorded pair, with the assumption under which the answer was found."""
+    """Joint identified from a recorded pair, with the assumption under which the answer was found.
+
+    See Also
+    --------
+    kineverse.estimation.recordings.identify_recorded_joint
+    """
 
     repeated: int  # number of rows that equal the one before; they do not count
     judged: int  # effective sample size by which the families were compared
@@ -114,6 +129,19 @@ def identify_recorded_joint(
     """Identify the joint of a recorded pair by the noise of its poses; without one, estimate it.
 
     Independent errors have no autocorrelation, which is else estimated.
+
+    Examples
+    --------
+    >>> table = np.zeros((20, 3))
+    >>> table[:, 0] = np.linspace(0, 0.4, 20)  # x of a drawer
+    >>> table += np.random.default_rng(0).normal(0, 0.002, table.shape)
+    >>> recording = kv.estimation.recordings.read_recording(table, columns="x,y,z")
+    >>> noise = kv.estimation.recordings.ObservationNoise(position=0.002, orientation=None, given=True)
+    >>> joint = kv.estimation.recordings.identify_recorded_joint(
+    ...     recording.pair(), noise, families=["prismatic", "revolute"]
+    ... )
+    >>> joint.fit.family, joint.is_ambiguous
+    ('prismatic', False)
     """
     comparison = _Comparison(pair, families, independent)
     if noise is None and pair.is_in_plane:
@@ -294,6 +322,18 @@ def make_joint_model(pair: RecordedPair, fit: Fit) -> Model:
 
     If only positions are observed, the child's axes are those of its parent at joint value 0. Such a part
     that moves freely has no joint.
+
+    Examples
+    --------
+    >>> angles = np.linspace(0, 1.2, 20)
+    >>> table = np.stack([0.5 * np.cos(angles), 0.5 * np.sin(angles), 0 * angles], axis=1)
+    >>> recording = kv.estimation.recordings.read_recording(table, columns="x,y,z")
+    >>> noise = kv.estimation.recordings.ObservationNoise(position=0.002, orientation=None, given=True)
+    >>> joint = kv.estimation.recordings.identify_recorded_joint(
+    ...     recording.pair(), noise, families=["prismatic", "revolute"]
+    ... )
+    >>> kv.estimation.recordings.make_joint_model(recording.pair(), joint.fit)
+    <Model: 1 frames, 1 DoF, 1 constraints (version 1)>
     """
     motion, names = fit.motion, (pair.child, pair.parent, pair.child)
     if motion.rows == 6 or fit.family == CURVE:

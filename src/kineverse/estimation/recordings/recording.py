@@ -20,7 +20,12 @@ _ROUNDING = 1e-9  # difference that rounding makes
 
 @dataclass(frozen=True, eq=False)
 class RecordedTrack:
-    """Recorded poses of one part."""
+    """Recorded poses of one part.
+
+    See Also
+    --------
+    kineverse.estimation.recordings.read_recording
+    """
 
     poses: Array  # (N, 4, 4) in the observer's frame [m]; (N, 3) for positions only
     rows: Indices  # of the table, (N,); parts in one row were observed at one time
@@ -44,7 +49,12 @@ def spaced_indices(count: int, size: int) -> Indices:
 
 @dataclass(frozen=True, eq=False)
 class RecordedPair:
-    """Synchronised poses of two parts."""
+    """Synchronised poses of two parts.
+
+    See Also
+    --------
+    kineverse.estimation.recordings.read_recording
+    """
 
     parent: str
     child: str
@@ -102,7 +112,12 @@ class RecordedPair:
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """Recorded tracks of a table."""
+    """Recorded tracks of a table.
+
+    See Also
+    --------
+    kineverse.estimation.recordings.read_recording
+    """
 
     source: str  # name of the file in messages
     tracks: Mapping[str, RecordedTrack]  # by name of the part; a table without names has one, called ""

@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from kineverse._names import answer_foreign_names
+from kineverse._rich_display import html_table
 from kineverse._synonyms import ESTIMATE_SYNONYMS
 from kineverse.compilation import compile
 from kineverse.estimation.linear_algebra import inverse_spd
@@ -144,6 +145,10 @@ class Estimate:
         Number of model evaluations; at 50 the iteration stopped without convergence.
     stamp
         Time [s]; None if unknown.
+
+    See Also
+    --------
+    kineverse.estimation.Tracker
     """
 
     def __init__(self, now: TrackerState, update_step: UpdateStep) -> None:
@@ -286,6 +291,12 @@ class Estimate:
         at = "" if self.stamp is None else f" at {self.stamp:g} s"
         values = ", ".join(f"{s}={value:.4g}±{self.deviation[s]:.2g}" for s, value in self.state.items())
         return f"<Estimate{at}: {values}{', lost' if self.lost else ''}>"
+
+    def _repr_html_(self) -> str:
+        rows = [(str(s), f"{value:.4g}", f"{self.deviation[s]:.2g}") for s, value in self.state.items()]
+        at = "" if self.stamp is None else f" at {self.stamp:g} s"
+        caption = f"estimate{at}{', lost' if self.lost else ''}"
+        return html_table(caption, ("coordinate", "value", "standard deviation"), rows)
 
 
 @dataclass(frozen=True, eq=False)

@@ -46,6 +46,15 @@ class ObservedPose(_Observed):
         pair of standard deviations [m], [rad]; by default 1 cm and 1°. See :func:`.pose_covariance`.
     name
         Key of its measurements; the name of the frame if empty.
+
+    Examples
+    --------
+    >>> model = kv.load("kitchen")
+    >>> seen = kv.estimation.ObservedPose("kitchen/fridge_door", covariance=(0.002, 0.01), name="tag 7")
+    >>> tracker = kv.estimation.Tracker(model, [seen])
+    >>> pose = model.fk("kitchen/fridge_door")({"kitchen/fridge_door": 0.9})
+    >>> round(tracker.update({"tag 7": pose}).state["kitchen/fridge_door"], 2)
+    0.9
     """
 
     frame: str
@@ -65,6 +74,15 @@ class ObservedPosition(_Observed):
         3×3, in the axes of ``relative_to`` [m²]; by default 1 cm.
     name
         Key of its measurements; the name of the frame if empty.
+
+    Examples
+    --------
+    >>> model = kv.load("kitchen")
+    >>> handle = kv.estimation.ObservedPosition("kitchen/fridge_door_handle")
+    >>> tracker = kv.estimation.Tracker(model, [handle])
+    >>> point = model.fk("kitchen/fridge_door_handle")({"kitchen/fridge_door": 0.9})[:3, 3]
+    >>> round(tracker.update({"kitchen/fridge_door_handle": point}).state["kitchen/fridge_door"], 2)
+    0.9
     """
 
     frame: str
@@ -85,6 +103,15 @@ class ObservedExpression:
         d×d, or the variance of a scalar.
     period
         Period of its values, such as 2π for an angle on a dial; None if they are not periodic.
+
+    Examples
+    --------
+    >>> model = kv.load("kitchen")
+    >>> door = model.symbol("kitchen/fridge_door")
+    >>> encoder = kv.estimation.ObservedExpression("encoder", 2 * door, covariance=1e-4)
+    >>> tracker = kv.estimation.Tracker(model, [encoder])
+    >>> round(tracker.update({"encoder": 1.6}).state[door], 3)
+    0.8
     """
 
     name: str

@@ -92,6 +92,17 @@ class Tracker:
         Time by which measurements may come late [s]; they are applied in the order of their times.
     keep
         Number of recent updates that :attr:`recent` has.
+
+    Examples
+    --------
+    >>> model = kv.load("kitchen")
+    >>> tracker = kv.estimation.Tracker(model, ["kitchen/fridge_door"])
+    >>> pose = model.fk("kitchen/fridge_door")({"kitchen/fridge_door": 0.9})
+    >>> estimate = tracker.update({"kitchen/fridge_door": pose})
+    >>> round(estimate.state["kitchen/fridge_door"], 2)
+    0.9
+    >>> round(estimate.deviation["kitchen/fridge_door"], 3)
+    0.017
     """
 
     def __init__(
@@ -204,7 +215,12 @@ class Tracker:
         return dict(self._recursion.noise)
 
     def copy(self) -> Tracker:
-        """Return an independent tracker in the same state; compiled code is shared, also between threads."""
+        """Return an independent tracker in the same state; compiled code is shared, also between threads.
+
+        See Also
+        --------
+        kineverse.estimation.Tracker
+        """
         with self._lock:
             other = copy.copy(self)
             other._lock = CallLock()
@@ -222,6 +238,16 @@ class Tracker:
         ----------
         model
             The edited model; the model of this tracker, as it is now, if None.
+
+        Examples
+        --------
+        >>> model = kv.load("kitchen")
+        >>> tracker = kv.estimation.Tracker(model, ["kitchen/fridge_door"])
+        >>> with model.edit() as edit:
+        ...     edit.constrain("ajar", 0, kv.position("kitchen/fridge_door"), 0.3)
+        'constraint ajar'
+        >>> tracker.rebuild().limits
+        {kitchen/fridge_door: (0.0, 0.3)}
         """
         other = Tracker(self.model if model is None else model, self._observed, **self._options)
         start = other._now
@@ -277,6 +303,13 @@ class Tracker:
         ------
         UnknownNameError, InvalidValueError
             For names that are not estimated, and numbers that are not finite.
+
+        Examples
+        --------
+        >>> model = kv.load("kitchen")
+        >>> tracker = kv.estimation.Tracker(model, ["kitchen/fridge_door"])
+        >>> tracker.reset({"kitchen/fridge_door": 0.4}).state["kitchen/fridge_door"]
+        0.4
         """
         tangent_space, now = self._layout.tangent_space, self._now
         stamp = now.stamp if at is None else require_time(at)
@@ -345,6 +378,15 @@ class Tracker:
             If time goes backwards or a number is not finite.
         UnknownNameError
             For a speed with which no estimated coordinate moves.
+
+        Examples
+        --------
+        >>> model = kv.load("kitchen")
+        >>> start = {"kitchen/fridge_door": 0.2}
+        >>> tracker = kv.estimation.Tracker(model, ["kitchen/fridge_door"], start=start)
+        >>> estimate = tracker.predict(1.0, commands={"kitchen/fridge_door:velocity": 0.3})
+        >>> round(estimate.state["kitchen/fridge_door"], 2)
+        0.5
         """
         dt = as_tolerance(dt, "The length of a step [s]")
         before, known = self._now, self._recursion.read_inputs(self._now.inputs, inputs)
@@ -398,6 +440,10 @@ class Tracker:
         UnknownNameError, ShapeError, InvalidValueError
             For an invalid measurement, naming it, or if time goes backwards by more than the lag. The belief
             does not change then.
+
+        See Also
+        --------
+        kineverse.estimation.Tracker
         """
         require_mapping(measurements, "A set of measurements")
         of_state, of_speeds = self._speed_update.read(measurements)
@@ -429,6 +475,16 @@ class Tracker:
             observations if None.
         at, commands, inputs, process_noise
             As in :meth:`update`.
+
+        Examples
+        --------
+        >>> model = kv.load("kitchen")
+        >>> tracker = kv.estimation.Tracker(model, ["kitchen/fridge_door", "kitchen/oven_door"])
+        >>> state = model.default_state() | {"kitchen/fridge_door": 0.5}
+        >>> poses = [model.fk(frame)(state) for frame in tracker.observed]
+        >>> estimate = tracker.update_poses(np.stack(poses), mask=[True, False])
+        >>> round(estimate.state["kitchen/fridge_door"], 2)
+        0.5
         """
         reading = self._update_step.reader.read_poses(poses, mask, covariances)
         return self._update(self._make_step(at, reading, commands, inputs, process_noise))
@@ -512,6 +568,21 @@ class HypothesisBank:
     ------
     InvalidValueError
         If there is no tracker, the observations differ, or the probabilities are not positive.
+
+    Examples
+    --------
+    >>> model = kv.load("kitchen")
+    >>> other = model.copy()
+    >>> with other.edit() as edit:
+    ...     edit.constrain("stuck", 0, kv.position("kitchen/fridge_door"), 0.1)
+    'constraint stuck'
+    >>> frames = ["kitchen/fridge_door"]
+    >>> bank = kv.estimation.HypothesisBank(
+    ...     {"free": kv.estimation.Tracker(model, frames), "stuck": kv.estimation.Tracker(other, frames)}
+    ... )
+    >>> probabilities = bank.update({frames[0]: model.fk(frames[0])({"kitchen/fridge_door": 0.9})})
+    >>> bank.best
+    'free'
     """
 
     def __init__(

@@ -44,6 +44,13 @@ class OpaqueOperation(Operation):
         Reason for a missing trace of an operation that read values, else empty.
     scope
         Prefix that the names in its parameters lack, with its slash.
+
+    Examples
+    --------
+    >>> data = kv.formats.to_bytes(kv.load("articulations/screw"))
+    >>> entry = kv.formats.entries_from_bytes(data)[0]
+    >>> entry.tag, entry.operation.kind, entry.operation.trace
+    ('screw/frame block', 'AddFrame', None)
     """
 
     kind: str

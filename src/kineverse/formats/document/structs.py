@@ -178,6 +178,12 @@ def schema() -> dict[str, Any]:
 
     It defines the parts of a document. Only the reader checks that references are to earlier nodes, shapes,
     limits on size and work, and the hash.
+
+    Examples
+    --------
+    >>> schema = kv.formats.document.schema()
+    >>> schema["$schema"]
+    'https://json-schema.org/draft/2020-12/schema'
     """
     content = msgspec.json.schema(Document)
     for name in ("folder", "root", "content"):  # parts of a mesh in memory

@@ -45,6 +45,13 @@ def write_document(model: ModelView, target: Path) -> None:
     ------
     FormatError
         If the file cannot be written, or for content that a document cannot carry; it is unchanged then.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> kv.formats.document.write_document(kv.load("kitchen"), Path("home.kv.json"))
+    >>> kv.load("home.kv.json")
+    <Model: 54 frames, 23 DoF, 46 constraints (version 1)>
     """
     is_packed = target.name.endswith(".kv.msgpack")
     try:
@@ -68,6 +75,13 @@ def to_json(model: ModelView, *, resources: bool = False) -> str:
     ------
     FormatError
         For content that a document cannot carry.
+
+    Examples
+    --------
+    >>> import json
+    >>> document = json.loads(kv.formats.document.to_json(kv.load("kitchen")))
+    >>> document["format"], len(document["operations"])
+    ('kineverse', 108)
     """
     entries = _entries(model)
     return encoding.print_document(_blobs(entries), **_beside(entries, resources))
@@ -87,6 +101,13 @@ def to_bytes(model: ModelView, *, resources: bool = False) -> bytes:
     ------
     FormatError
         For content that a document cannot carry.
+
+    Examples
+    --------
+    >>> model = kv.load("kitchen")
+    >>> data = kv.formats.to_bytes(model)
+    >>> kv.formats.from_bytes(data)
+    <Model: 54 frames, 23 DoF, 46 constraints (version 1)>
     """
     entries = _entries(model)
     return encoding.pack_document(_blobs(entries), **_beside(entries, resources))
@@ -107,6 +128,12 @@ def document_hash(model: ModelView) -> str:
     ------
     FormatError
         For content that a document cannot carry.
+
+    Examples
+    --------
+    >>> model = kv.load("kitchen")
+    >>> kv.formats.document_hash(model) == kv.formats.document_hash(model.copy())
+    True
     """
     return encoding.hash_blobs(_blobs(_entries(model)))
 
@@ -127,6 +154,10 @@ def operation_to_bytes(model: ModelView, tag: str) -> bytes:
         If there is no such operation.
     FormatError
         For content that a document cannot carry.
+
+    See Also
+    --------
+    kineverse.formats.operation_from_bytes
     """
     if isinstance(model, Model) and model._edit is None:
         entries: Sequence[HistoryEntry] = model.history.sequence  # without a snapshot, which lists all values
@@ -155,12 +186,27 @@ def entry_to_bytes(entry: HistoryEntry, entries: Sequence[HistoryEntry]) -> byte
     ------
     FormatError
         For content that a document cannot carry.
+
+    Examples
+    --------
+    >>> model = kv.load("kitchen")
+    >>> entries = model.history.sequence
+    >>> blob = kv.formats.entry_to_bytes(entries[0], entries)
+    >>> blob == kv.formats.operation_to_bytes(model, entries[0].tag)
+    True
     """
     return entry.blob or _blob(entry, entries)
 
 
 def operation_digest(model: ModelView, tag: str) -> str:
-    """Return SHA-256 of :func:`operation_to_bytes`, 64 hexadecimal digits."""
+    """Return SHA-256 of :func:`operation_to_bytes`, 64 hexadecimal digits.
+
+    Examples
+    --------
+    >>> model = kv.load("kitchen")
+    >>> kv.formats.operation_digest(model, "joint kitchen/fridge_door")[:8]
+    '8af535b1'
+    """
     return encoding.digest(operation_to_bytes(model, tag)).hex()
 
 

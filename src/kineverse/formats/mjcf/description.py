@@ -37,6 +37,10 @@ class MjcfJoint:
     velocity, None if unknown. ``frame`` is the name of the frame that it moves, if that is not the body.
     ``home`` is the home position of its coordinates. ``dynamics`` are those of effort [N] or [N m], damping,
     friction, spring_stiffness, spring_reference and armature that are not zero.
+
+    See Also
+    --------
+    kineverse.formats.mjcf.parse_mjcf
     """
 
     name: str
@@ -55,7 +59,12 @@ class MjcfJoint:
 
 @dataclass(frozen=True, slots=True)
 class MjcfLink:
-    """Body: its pose in its parent while its joints are at their references, and the joints that move it."""
+    """Body: its pose in its parent while its joints are at their references, and the joints that move it.
+
+    See Also
+    --------
+    kineverse.formats.mjcf.parse_mjcf
+    """
 
     name: str
     parent: str
@@ -67,7 +76,12 @@ class MjcfLink:
 
 @dataclass(frozen=True, slots=True)
 class MjcfSite:
-    """Frame fixed to a body."""
+    """Frame fixed to a body.
+
+    See Also
+    --------
+    kineverse.formats.mjcf.parse_mjcf
+    """
 
     name: str
     parent: str
@@ -135,6 +149,10 @@ class MjcfScene:
 
     ``links`` begin with the world, each after its parent. ``remarks`` are warnings about ignored or ambiguous
     elements, each with its line. ``has_home`` is True if the file has a home position.
+
+    See Also
+    --------
+    kineverse.formats.mjcf.parse_mjcf
     """
 
     links: tuple[MjcfLink, ...] = ()

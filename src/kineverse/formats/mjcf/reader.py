@@ -42,6 +42,13 @@ def read_mjcf(
         If the file cannot be read or is not a valid MJCF; the message names file, line, element and reason.
     MissingDependencyError
         If MuJoCo is not installed.
+
+    Examples
+    --------
+    >>> result = kv.load("shelf_door").save("shelf.xml")
+    >>> scene = kv.formats.mjcf.read_mjcf("shelf.xml")
+    >>> [joint.name for link in scene.links for joint in link.joints]
+    ['shelf_door/door']
     """
     path = Path(path)
     return parse_mjcf(read_file(path), path.name, str(path.absolute().parent), root, strict)
@@ -73,6 +80,22 @@ def parse_mjcf(
         If the text is no valid MJCF; the message names source, line, element and reason.
     MissingDependencyError
         If MuJoCo is not installed.
+
+    Examples
+    --------
+    >>> text = '''
+    ... <mujoco>
+    ...   <worldbody>
+    ...     <body name="door">
+    ...       <joint name="hinge" axis="0 0 1" range="0 90" limited="true"/>
+    ...       <geom type="box" size="0.4 0.02 1" mass="10"/>
+    ...     </body>
+    ...   </worldbody>
+    ... </mujoco>
+    ... '''
+    >>> scene = kv.formats.mjcf.parse_mjcf(text)
+    >>> round(scene.links[1].joints[0].upper, 3)
+    1.571
     """
     mjcf_warnings = _MjcfWarnings(source, strict)
     add, repair = mjcf_warnings.add, mjcf_warnings.repair

@@ -44,6 +44,10 @@ class SdfAxis:
     effort [N m] or [N], damping, friction, spring_reference and spring_stiffness that are given. ``suffix``
     is the part of the coordinate's name after that of the joint. ``mimic`` is the relation to the coordinate
     that the axis follows, at the end of the chain.
+
+    See Also
+    --------
+    kineverse.formats.sdf.parse_sdf
     """
 
     xyz: Vector3 = (0.0, 0.0, 1.0)
@@ -65,6 +69,10 @@ class SdfJoint:
     another one. ``home`` are default values of its coordinates, and ``zero`` their values at the poses of the
     file; empty for 0. ``loop`` is the loop that it closes, if the file states one. ``is_reversed`` is True if
     parent and child were exchanged to form a tree; the axes are then negated and in reverse order.
+
+    See Also
+    --------
+    kineverse.formats.sdf.parse_sdf
     """
 
     name: str
@@ -91,6 +99,10 @@ class SdfLink:
 
     ``free`` is the name of its free motion, if the file states one, and ``home`` are the coordinates of that
     motion at the pose; empty for no motion.
+
+    See Also
+    --------
+    kineverse.formats.sdf.parse_sdf
     """
 
     name: str
@@ -105,7 +117,12 @@ class SdfLink:
 
 @dataclass(frozen=True, slots=True)
 class SdfFrame:
-    """Frame of a ``<frame>`` or of a model, fixed to a link or to the world."""
+    """Frame of a ``<frame>`` or of a model, fixed to a link or to the world.
+
+    See Also
+    --------
+    kineverse.formats.sdf.parse_sdf
+    """
 
     name: str
     parent: str
@@ -116,7 +133,12 @@ class SdfFrame:
 
 @dataclass(frozen=True, slots=True)
 class SdfRoot:
-    """Link without parent joint; it is fixed to the world, or moves freely if ``free``."""
+    """Link without parent joint; it is fixed to the world, or moves freely if ``free``.
+
+    See Also
+    --------
+    kineverse.formats.sdf.parse_sdf
+    """
 
     link: str
     free: bool = False
@@ -129,6 +151,10 @@ class SdfScene:
     ``joints`` are ordered from the ``roots`` outwards, each after the joint of its parent link. ``loops`` are
     the joints that close loops. ``remarks`` are warnings about ignored or ambiguous elements, each with its
     line.
+
+    See Also
+    --------
+    kineverse.formats.sdf.parse_sdf
     """
 
     links: tuple[SdfLink, ...] = ()

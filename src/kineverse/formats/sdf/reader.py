@@ -284,6 +284,13 @@ def read_sdf(
     ------
     FormatError
         If a file cannot be read or is not a valid SDF; the message names file, line, element and reason.
+
+    Examples
+    --------
+    >>> result = kv.load("shelf_door").save("shelf.sdf")
+    >>> scene = kv.formats.sdf.read_sdf("shelf.sdf")
+    >>> [joint.name for joint in scene.joints]
+    ['shelf_door/shelf', 'shelf_door/body_joint', 'shelf_door/door', 'shelf_door/door_handle_joint']
     """
     path = Path(path)
     return parse_sdf(read_file(path), path.name, str(path.absolute().parent), root, strict)
@@ -313,6 +320,25 @@ def parse_sdf(
     ------
     FormatError
         If the text is no valid SDF; the message names source, line, element and reason.
+
+    Examples
+    --------
+    >>> text = '''
+    ... <sdf version="1.9">
+    ...   <model name="cupboard">
+    ...     <link name="body"/>
+    ...     <link name="door"/>
+    ...     <joint name="hinge" type="revolute">
+    ...       <parent>body</parent>
+    ...       <child>door</child>
+    ...       <axis><xyz>0 0 1</xyz><limit><lower>0</lower><upper>1.5</upper></limit></axis>
+    ...     </joint>
+    ...   </model>
+    ... </sdf>
+    ... '''
+    >>> (joint,) = kv.formats.sdf.parse_sdf(text).joints
+    >>> joint.name, joint.kind, joint.axes[0].upper
+    ('hinge', 'revolute', 1.5)
     """
     remarks: list[str] = []
     root_folder = find_text_root(folder, root)

@@ -30,6 +30,10 @@ class SrdfGroup(Struct, frozen=True):
         Frames of the group: listed links, both ends of chains and all between, children of the joints.
     states
         Named states of the group: values [m], [rad] by the name of the coordinate.
+
+    See Also
+    --------
+    kineverse.formats.srdf.parse_srdf
     """
 
     name: str
@@ -50,6 +54,10 @@ class EndEffector(Struct, frozen=True):
         Frame that carries it.
     parent_group
         Name of the group that moves it; empty if the file names none.
+
+    See Also
+    --------
+    kineverse.formats.srdf.parse_srdf
     """
 
     name: str
@@ -71,6 +79,10 @@ class VirtualJoint(Struct, frozen=True):
         Frame in which the robot stands, as in the file: it belongs to no robot and has no prefix.
     child_link
         Frame of the robot.
+
+    See Also
+    --------
+    kineverse.formats.srdf.parse_srdf
     """
 
     name: str
@@ -96,6 +108,10 @@ class Srdf(Struct, frozen=True):
         Articulations that no motor moves.
     warnings
         Faults of the file, each with its line.
+
+    See Also
+    --------
+    kineverse.formats.srdf.parse_srdf
     """
 
     name: str

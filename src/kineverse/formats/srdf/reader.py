@@ -42,6 +42,15 @@ def read_srdf(
         If the file cannot be read or is no SRDF; the message names file, line, element and reason.
     UnknownNameError
         If none of its links is in the model below the prefix.
+
+    Examples
+    --------
+    >>> text = "<robot name='r'><group name='oven'><joint name='oven_door'/></group></robot>"
+    >>> with open("kitchen.srdf", "w", encoding="utf-8") as file:
+    ...     size = file.write(text)
+    >>> srdf = kv.formats.read_srdf("kitchen.srdf", kv.load("kitchen"), prefix="kitchen")
+    >>> srdf.groups["oven"].links
+    ('kitchen/oven_door',)
     """
     path = Path(path)
     return parse_srdf(read_file(path), model, prefix, source=path.name, strict=strict)
@@ -70,6 +79,18 @@ def parse_srdf(
         If the text is no SRDF, or the prefix is none; the message names source, line, element and reason.
     UnknownNameError
         If none of its links is in the model below the prefix.
+
+    Examples
+    --------
+    >>> text = '''
+    ... <robot name="kitchen">
+    ...   <group name="fridge"><joint name="fridge_door"/></group>
+    ...   <group_state name="ajar" group="fridge"><joint name="fridge_door" value="0.2"/></group_state>
+    ... </robot>
+    ... '''
+    >>> srdf = kv.formats.srdf.parse_srdf(text, kv.load("kitchen"), prefix="kitchen")
+    >>> srdf.groups["fridge"].coordinates, srdf.states
+    (('kitchen/fridge_door',), {'ajar': {'kitchen/fridge_door': 0.2}})
     """
     check_prefix(prefix)
     remarks = ReaderWarnings(source, strict=strict)

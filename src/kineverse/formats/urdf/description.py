@@ -45,6 +45,10 @@ class UrdfLimits(Struct, frozen=True):
     [rad/s] or [m/s], ``effort`` that of the torque [N m] or force [N]. From URDF 1.2 on, ``acceleration`` and
     ``deceleration`` bound the rates at which the speed grows and falls [rad/s²] or [m/s²], and ``jerk`` the
     magnitude of the jerk [rad/s³] or [m/s³].
+
+    See Also
+    --------
+    kineverse.formats.urdf.parse_urdf
     """
 
     lower: float | None = None
@@ -66,6 +70,10 @@ class UrdfSafetyController(Struct, frozen=True):
     soft_upper)``. The joint slows down towards the soft limits and returns from beyond them. ``k_velocity``
     bounds the effort near the velocity limit in the same manner. Soft limits are in [rad] or [m],
     ``k_position`` is in [1/s].
+
+    See Also
+    --------
+    kineverse.formats.urdf.parse_urdf
     """
 
     soft_lower: float = 0.0
@@ -80,7 +88,12 @@ class UrdfSafetyController(Struct, frozen=True):
 
 
 class UrdfDynamics(Struct, frozen=True):
-    """Damping [N s/m] or [N m s/rad] and static friction [N] or [N m] of a joint."""
+    """Damping [N s/m] or [N m s/rad] and static friction [N] or [N m] of a joint.
+
+    See Also
+    --------
+    kineverse.formats.urdf.parse_urdf
+    """
 
     damping: float = 0.0
     friction: float = 0.0
@@ -97,6 +110,10 @@ class UrdfJoint(Struct, frozen=True):
     the plane; None for joints without axis. The ``limits`` of a planar joint hold for both directions in the
     plane; those of a floating joint are an effort only. ``mimic`` and soft limits are defined for joints of
     one DoF; ``mimic`` is the relation to the independent joint at the end of its chain.
+
+    See Also
+    --------
+    kineverse.formats.urdf.parse_urdf
     """
 
     name: str
@@ -113,7 +130,12 @@ class UrdfJoint(Struct, frozen=True):
 
 
 class UrdfLink(Struct, frozen=True):
-    """Link: a frame and the body attached to it."""
+    """Link: a frame and the body attached to it.
+
+    See Also
+    --------
+    kineverse.formats.urdf.parse_urdf
+    """
 
     name: str
     body: Body = NO_BODY
@@ -127,6 +149,10 @@ class UrdfRobot(Struct, frozen=True):
     joint of its parent link. ``more_roots`` are further links without parent, in files that are no tree;
     their pose is that of the root. ``remarks`` are warnings about ignored or ambiguous elements, each with
     its line. ``kept`` are the parts that say nothing of motion.
+
+    See Also
+    --------
+    kineverse.formats.urdf.parse_urdf
     """
 
     name: str

@@ -50,6 +50,12 @@ def read_urdf(
     ------
     FormatError
         If the file cannot be read or is not a valid URDF; the message names file, line, element and reason.
+
+    Examples
+    --------
+    >>> robot = kv.formats.urdf.read_urdf(kv.formats.locate_model("pr2").path)
+    >>> robot.name, robot.root, robot.dof
+    ('pr2', 'base_footprint', 19)
     """
     path = Path(path)
     return parse_urdf(read_file(path), path.name, str(path.absolute().parent), root, strict)
@@ -79,6 +85,24 @@ def parse_urdf(
     ------
     FormatError
         If the text is no valid URDF; the message names source, line, element and reason.
+
+    Examples
+    --------
+    >>> text = '''
+    ... <robot name="cupboard">
+    ...   <link name="body"/>
+    ...   <link name="door"/>
+    ...   <joint name="hinge" type="revolute">
+    ...     <parent link="body"/>
+    ...     <child link="door"/>
+    ...     <axis xyz="0 0 1"/>
+    ...     <limit lower="0" upper="1.5" velocity="1" effort="10"/>
+    ...   </joint>
+    ... </robot>
+    ... '''
+    >>> robot = kv.formats.urdf.parse_urdf(text)
+    >>> robot.root, robot.dof, robot.joints[0].limits.upper
+    ('body', 1, 1.5)
     """
     remarks = ReaderWarnings(source, strict=strict)
     document = _Document(folder, find_text_root(folder, root), remarks)

@@ -70,6 +70,13 @@ def stage_poses(
         If there is no such coordinate or body.
     ShapeError, InvalidValueError
         If a position is not a finite number, or a pose not a rigid transform.
+
+    Examples
+    --------
+    >>> result = kv.load("shelf_door").save("shelf.usda")
+    >>> poses = kv.formats.usd.stage_poses("shelf.usda", {"shelf_door/door": 0.5})
+    >>> poses["shelf_door/door"][:3, 0].round(3)
+    array([-0.878, -0.479,  0.   ])
     """
     file = Path(path)
     tree = StagePoses(read_scene(open_stage(file), file.name))

@@ -34,6 +34,10 @@ class Accuracy:
         Largest distance of the hulls outside of the mesh [m], from the surface of the mesh.
     uncovered
         Largest distance of the surface of the mesh from the union of the hulls [m].
+
+    See Also
+    --------
+    kineverse.geometry.decomposition.decompose
     """
 
     mesh_volume: float | None

@@ -48,7 +48,12 @@ _MEMORY_ERRORS = (
 
 
 class DecompositionError(KineverseError, RuntimeError):
-    """Failed decomposition: CoACD crashed, ran out of time or memory, or returned impossible hulls."""
+    """Failed decomposition: CoACD crashed, ran out of time or memory, or returned impossible hulls.
+
+    See Also
+    --------
+    kineverse.geometry.decomposition.decompose
+    """
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,6 +66,10 @@ class ResourceLimits:
         Time [s].
     memory
         Address space [bytes]; not bounded on Windows, and not reliably on macOS.
+
+    See Also
+    --------
+    kineverse.geometry.decomposition.decompose
     """
 
     seconds: float = 600.0
@@ -200,7 +209,12 @@ DEFAULTS, LIMITS = DecompositionSettings(), ResourceLimits()
 
 @dataclass(frozen=True, slots=True)
 class DecompositionOutcome:
-    """Outcome for one mesh: a decomposition, from the cache or new, or an error."""
+    """Outcome for one mesh: a decomposition, from the cache or new, or an error.
+
+    See Also
+    --------
+    kineverse.geometry.decomposition.decompose_all
+    """
 
     mesh: Mesh
     decomposition: Decomposition | None = None
@@ -226,6 +240,10 @@ def find_hulls(mesh: Mesh, settings: DecompositionSettings | None = None) -> tup
     ------
     FormatError, InvalidValueError, MissingDependencyError
         If the mesh cannot be read or decomposed.
+
+    See Also
+    --------
+    kineverse.geometry.decomposition.decompose
     """
     surface = clean_mesh(mesh)
     found = result.find_entry(surface.digest, settings.key(surface.size) if settings else None)
@@ -262,6 +280,17 @@ def decompose(
         If CoACD, coal or trimesh is not installed.
     DecompositionError
         If CoACD fails, or exceeds its limits.
+
+    Examples
+    --------
+    >>> import trimesh
+    >>> bracket = trimesh.util.concatenate(
+    ...     [trimesh.creation.box((0.3, 0.1, 0.02)), trimesh.creation.box((0.02, 0.1, 0.3))]
+    ... )
+    >>> data = bracket.export("bracket.stl")
+    >>> outcome = kv.geometry.decomposition.decompose(kv.model.Mesh("bracket.stl"))
+    >>> len(outcome.decomposition.hulls) > 1
+    True
     """
     surface = clean_mesh(mesh)
     digest, key = surface.digest, settings.key(surface.size)
@@ -296,6 +325,10 @@ def decompose_all(
     ------
     MissingDependencyError
         If CoACD, coal or trimesh is not installed.
+
+    See Also
+    --------
+    kineverse.geometry.decomposition.decompose
     """
     stop = threading.Event()
 

@@ -8,12 +8,11 @@ import json
 import logging
 import math
 from dataclasses import asdict, dataclass, replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
 
-from kineverse.compilation.cache import ContentCache, private_subfolder
+from kineverse.compilation.cache_kinds import KINDS
 from kineverse.errors import FormatError, InvalidValueError
 from kineverse.geometry.mesh_files import Floats
 
@@ -41,6 +40,12 @@ class DecompositionSettings:
     ------
     InvalidValueError
         If one of them is not positive.
+
+    Examples
+    --------
+    >>> settings = kv.geometry.decomposition.DecompositionSettings(max_hulls=8)
+    >>> settings.max_error(0.5)  # of a mesh 0.5 m long: 2 %
+    0.01
     """
 
     error: float | None = None
@@ -84,6 +89,10 @@ class Decomposition:
         Time of creation, in seconds since 1970.
     remarks
         Defects of the mesh.
+
+    See Also
+    --------
+    kineverse.geometry.decomposition.decompose
     """
 
     hulls: tuple[Floats, ...]
@@ -129,19 +138,20 @@ class Decomposition:
             raise FormatError("This is not a decomposition.") from error
 
 
-DECOMPOSITIONS = ContentCache(
-    partial(private_subfolder, "decompositions"),
-    ".hulls",
-    256 * 2**20,
-    logging.getLogger("kineverse.geometry"),
-    "The decomposition %s %s and counts as absent.",
+DECOMPOSITIONS = KINDS["decompositions"].make_cache(
+    logging.getLogger("kineverse.geometry"), "The decomposition %s %s and counts as absent."
 )
 """The cache."""
 
 
 @dataclass(frozen=True, slots=True)
 class CacheEntry:
-    """Cached decomposition, and the size of its file [bytes]."""
+    """Cached decomposition, and the size of its file [bytes].
+
+    See Also
+    --------
+    kineverse.geometry.decomposition.list_entries
+    """
 
     decomposition: Decomposition
     bytes: int
@@ -162,18 +172,34 @@ def add_entry(mesh: str, settings: str, decomposition: Decomposition) -> None:
 
 
 def list_entries() -> list[CacheEntry]:
-    """Return all entries of the cache, sorted by the name of the mesh file."""
+    """Return all entries of the cache, sorted by the name of the mesh file.
+
+    See Also
+    --------
+    kineverse.geometry.decomposition.decompose
+    """
     kept = [CacheEntry(*entry) for entry in DECOMPOSITIONS.read_all(Decomposition.from_bytes)]
     return sorted(kept, key=lambda one: (one.decomposition.name, one.decomposition.made))
 
 
 def clear() -> int:
-    """Remove all entries, and return their number."""
+    """Remove all entries, and return their number.
+
+    See Also
+    --------
+    kineverse.geometry.decomposition.decompose
+    """
     return DECOMPOSITIONS.clear()
 
 
 def folder() -> Path:
-    """Return the path of the cache folder."""
+    """Return the path of the cache folder.
+
+    Examples
+    --------
+    >>> kv.geometry.decomposition.folder().name
+    'decompositions'
+    """
     return DECOMPOSITIONS.folder.path
 
 

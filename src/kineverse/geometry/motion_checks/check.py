@@ -48,6 +48,12 @@ def check_motion(model: ModelView, faults: Iterable[str] = ()) -> MotionReport:
     ------
     MissingDependencyError
         If coal is not installed.
+
+    Examples
+    --------
+    >>> report = kv.geometry.check_motion(kv.load("shelf_door"))
+    >>> report.ok, [one.name for one in report.coordinates]
+    (True, ['shelf_door/door'])
     """
     import_coal()
     parts = MovingParts(model)

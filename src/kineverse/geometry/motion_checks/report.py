@@ -62,6 +62,10 @@ class MotionFinding:
         What was measured, what is accepted, and the unit of both: m, rad, kg/m³ or ``1``; None without one.
     state
         Values of coordinates at which it was measured; the others are at their default.
+
+    See Also
+    --------
+    kineverse.geometry.check_motion
     """
 
     kind: str
@@ -106,6 +110,10 @@ class CoordinateReport:
         Name of the coordinate; empty for the bodies that nothing moves.
     entries
         Everything, in the order of the checks.
+
+    See Also
+    --------
+    kineverse.geometry.check_motion
     """
 
     name: str
@@ -155,6 +163,10 @@ class MotionReport:
         A report for each degree of freedom, in the order of the model.
     at_rest
         The report of the bodies that nothing moves.
+
+    See Also
+    --------
+    kineverse.geometry.check_motion
     """
 
     coordinates: tuple[CoordinateReport, ...]
@@ -179,6 +191,17 @@ class MotionReport:
     def suspects(self) -> tuple[MotionFinding, ...]:
         """All suspects."""
         return tuple(entry for report in self.all for entry in report.suspects)
+
+    def _repr_html_(self) -> str:
+        from kineverse._rich_display import html_table  # for start-up time
+
+        rows = [
+            (report.name or "at rest", entry.severity.replace("_", " "), entry.kind, entry.text, entry.advice)
+            for report in self.all
+            for entry in (*report.findings, *report.suspects, *report.cannot_say)
+        ]
+        caption = f"{len(self.findings)} findings, {len(self.suspects)} suspects"
+        return html_table(caption, ("coordinate", "", "kind", "what", "advice"), rows)
 
     def __getitem__(self, name: Symbol | str) -> CoordinateReport:
         """Return the report of a coordinate."""

@@ -39,6 +39,10 @@ class LockTry:
         The coordinate, and where it was to go [m] or [rad].
     moved
         Whether it arrived.
+
+    See Also
+    --------
+    kineverse.manipulation.explore_locks
     """
 
     coordinate: Symbol
@@ -67,6 +71,10 @@ class LearnedLock:
         Further conditions, which held whenever the part moved.
     is_conjunction
         False if no conjunction agrees with the tries; then nothing is certain.
+
+    See Also
+    --------
+    kineverse.manipulation.explore_locks
     """
 
     coordinate: Symbol
@@ -108,6 +116,10 @@ class LockExploration:
         The last plan, by the model as it was learned.
     state
         Positions at the end.
+
+    See Also
+    --------
+    kineverse.manipulation.explore_locks
     """
 
     done: bool

@@ -44,6 +44,14 @@ class PartMover:
     ------
     InvalidValueError
         For a patience or a speed that is not positive.
+
+    Examples
+    --------
+    >>> box = kv.load("lockboxes/thesis")
+    >>> session = kv.manipulation.Session(kv.worlds.MechanismWorld(box), dt=0.05)
+    >>> mover = kv.manipulation.PartMover(box, session)
+    >>> round(mover.move("lockbox/f", 0.5), 2)
+    0.5
     """
 
     def __init__(
@@ -111,6 +119,10 @@ class ExecutedMove:
         Time that it took [s].
     done
         Whether it ended at the target.
+
+    See Also
+    --------
+    kineverse.manipulation.execute_unlocking
     """
 
     step: UnlockingStep
@@ -158,6 +170,10 @@ class UnlockingExecution:
         Time that it took [s].
     state
         Believed state at the end.
+
+    See Also
+    --------
+    kineverse.manipulation.execute_unlocking
     """
 
     done: bool

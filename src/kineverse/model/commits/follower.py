@@ -18,17 +18,17 @@ from .listeners import Commit, CommitFilter
 
 _LOG = logging.getLogger(__name__)
 
-T = TypeVar("T")
+Built = TypeVar("Built")
 
 
 def follow(
     model: Model,
-    build: Callable[[Snapshot], T],
+    build: Callable[[Snapshot], Built],
     *,
     frames: Iterable[str] | None = None,
     symbols: Iterable[Symbol] | None = None,
     paths: Iterable[str] | None = None,
-) -> Follower[T]:
+) -> Follower[Built]:
     """Build a value from a model now, and anew in the background when what it reads has changed.
 
     For what is made once and used in a loop: a compiled function, a controller, a tracker, a scene. The value
@@ -55,6 +55,17 @@ def follow(
     ------
     Exception
         Whatever the first build raises. Errors of later ones are in :attr:`Follower.error`.
+
+    Examples
+    --------
+    >>> model = kv.load("kitchen")
+    >>> build = lambda snapshot: kv.compile(snapshot.fk("kitchen/fridge_door_handle"), tier="interpreter")
+    >>> follower = kv.follow(model, build, frames=["kitchen/fridge_door_handle"])
+    >>> follower.value([0.5])[:3, 3].round(3)
+    array([ 0.842, -1.403,  1.184])
+    >>> follower.version
+    1
+    >>> follower.close()
     """
     if not isinstance(model, Model):
         raise ExpressionError(f"A kv.Model can be followed, and a {type(model).__name__} does not change.")
@@ -65,14 +76,19 @@ def follow(
     return Follower(model, build, CommitFilter.of(paths, symbols, None, frames))
 
 
-class BuiltValue(NamedTuple, Generic[T]):
-    """Value with the version of the model that it was built from."""
+class BuiltValue(NamedTuple, Generic[Built]):
+    """Value with the version of the model that it was built from.
 
-    value: T
+    See Also
+    --------
+    kineverse.follow
+    """
+
+    value: Built
     version: int
 
 
-class Follower(Closing, Generic[T]):
+class Follower(Closing, Generic[Built]):
     """Value that follows a model, from :func:`kineverse.follow`; :meth:`close` ends that.
 
     Attributes
@@ -81,12 +97,16 @@ class Follower(Closing, Generic[T]):
         The value and the version of the model that it was built from, together.
     error
         Exception of the last build, if it failed; the value is then that of the last one that did not.
+
+    See Also
+    --------
+    kineverse.follow
     """
 
-    current: BuiltValue[T]
+    current: BuiltValue[Built]
     error: BaseException | None
 
-    def __init__(self, model: Model, build: Callable[[Snapshot], T], wanted: CommitFilter) -> None:
+    def __init__(self, model: Model, build: Callable[[Snapshot], Built], wanted: CommitFilter) -> None:
         self._model = model
         self._build = build
         self._filter = wanted
@@ -110,7 +130,7 @@ class Follower(Closing, Generic[T]):
             self._start()
 
     @property
-    def value(self) -> T:
+    def value(self) -> Built:
         """The value of the last build that succeeded."""
         return self.current.value
 
@@ -133,6 +153,19 @@ class Follower(Closing, Generic[T]):
         -------
         bool
             False if the time is over, the follower is closed, or the build for that version has failed.
+
+        Examples
+        --------
+        >>> model = kv.load("kitchen")
+        >>> follower = kv.follow(model, lambda snapshot: len(snapshot.frames))
+        >>> with model.edit() as edit:
+        ...     edit.add_frame("lamp", parent="world")
+        'frame lamp'
+        >>> follower.wait(timeout=60)
+        True
+        >>> follower.value
+        55
+        >>> follower.close()
         """
         wanted = self._model.version if version is None else as_count("version", version, 0)
         limit = None if timeout is None else as_tolerance(timeout, "A timeout")

@@ -191,7 +191,12 @@ _EVERYTHING = CommitFilter()
 
 @dataclass(frozen=True, eq=False)
 class Listener(Closing):
-    """Callback with its filter; :meth:`close` unregisters it."""
+    """Callback with its filter; :meth:`close` unregisters it.
+
+    See Also
+    --------
+    kineverse.Model.listen
+    """
 
     callback: Callback
     filter: CommitFilter

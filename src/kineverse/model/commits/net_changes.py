@@ -40,6 +40,10 @@ class PlacedEntry:
     at_end
         True if nothing follows but what the edit has put there. It then goes to the end of any model, after
         what others have put there meanwhile.
+
+    See Also
+    --------
+    kineverse.Model.adopt
     """
 
     entry: HistoryEntry
@@ -63,6 +67,10 @@ class NetChanges:
         Tags of those in ``replaced`` that are at another place among the others.
     removed
         Tags of operations that are gone.
+
+    See Also
+    --------
+    kineverse.Model.adopt
     """
 
     put: tuple[PlacedEntry, ...] = ()

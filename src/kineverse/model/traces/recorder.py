@@ -41,6 +41,10 @@ def record_trace(operation: Operation, model: ReadRecorder, writes: Mapping[Cell
     ------
     UntraceableError
         If the code needs the values that it reads.
+
+    See Also
+    --------
+    kineverse.formats.document.OpaqueOperation
     """
     if not operation.traceable:
         raise UntraceableError("what it computes follows from numbers that it reads")

@@ -49,6 +49,10 @@ class ReadNode(Node):
     The options are the tracer (None for none), the index of the query, the index of the expression in its
     result, and the *path*: the gradient entries that lead from that expression to this one, each with a flag
     for heuristic entries.
+
+    See Also
+    --------
+    kineverse.formats.document.OpaqueOperation
     """
 
     __slots__ = ()
@@ -193,12 +197,22 @@ MAX_ANSWER = 200_000  # largest number of nodes in a query result
 
 
 class UntraceableError(ModelError):
-    """Operation that depends on values it reads in a way that a trace cannot represent."""
+    """Operation that depends on values it reads in a way that a trace cannot represent.
+
+    See Also
+    --------
+    kineverse.formats.document.OpaqueOperation
+    """
 
 
 @dataclass(frozen=True)
 class TraceStep:
-    """Query of an operation, with the access to its result."""
+    """Query of an operation, with the access to its result.
+
+    See Also
+    --------
+    kineverse.formats.document.OpaqueOperation
+    """
 
     query: Query
     access: Access
@@ -214,6 +228,10 @@ class Trace:
         Queries in order. The arguments of a query may contain results of earlier ones.
     writes
         Written values by cell, with :class:`.placeholder.ReadNode` nodes for query results.
+
+    See Also
+    --------
+    kineverse.formats.document.OpaqueOperation
     """
 
     steps: tuple[TraceStep, ...]

@@ -25,7 +25,12 @@ from kineverse.symbols import Symbol
 
 
 class Access(IntEnum):
-    """Access of an operation to the expressions of a query result."""
+    """Access of an operation to the expressions of a query result.
+
+    See Also
+    --------
+    kineverse.formats.document.OpaqueOperation
+    """
 
     NOT = 0
     """It computed with the expressions only."""
@@ -61,6 +66,10 @@ class Query:
         One of :data:`QUERY_KINDS`.
     arguments
         Names or expressions.
+
+    See Also
+    --------
+    kineverse.formats.document.OpaqueOperation
     """
 
     kind: str

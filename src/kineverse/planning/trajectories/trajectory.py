@@ -24,9 +24,11 @@ import numpy.typing as npt
 
 from kineverse._checks import finite_number
 from kineverse._names import answer_foreign_names
+from kineverse._rich_display import draw_curves, element, html_table, picture_element
 from kineverse._synonyms import TRAJECTORY_SYNONYMS
 from kineverse.errors import ExpressionError, FormatError, InvalidValueError, ShapeError
 from kineverse.expressions.expression import ExpressionLike
+from kineverse.expressions.printing import format_number
 from kineverse.formats.files import read_file, replace_file
 from kineverse.lie import Array
 from kineverse.model.model_view import ModelView
@@ -37,6 +39,7 @@ if TYPE_CHECKING:
     from kineverse.control import Controller
 
 _JUMP = 1e-6  # largest difference of positions [rad], [m] and velocities where two are joined
+_SAMPLES = 200  # number of points of a drawn curve: two pixels apart
 _GAIN, _WEIGHT = 5.0, 100.0  # gain [1/s] and weight of the goals of a follower
 
 
@@ -63,6 +66,13 @@ class Trajectory:
     InvalidValueError
         For times that do not begin at 0 or do not increase, numbers that are not finite, a symbol that is
         there twice, or one that is no coordinate.
+
+    Examples
+    --------
+    >>> q = kv.position("door")
+    >>> motion = kv.planning.time_parameterize([[0.0], [1.0]], 1.0, 2.0, symbols=[q])
+    >>> motion.duration, motion.at(0.75)
+    (1.5, State({door: 0.5}, stamp=0.75))
     """
 
     symbols: tuple[Symbol, ...]
@@ -284,6 +294,19 @@ class Trajectory:
         size = f"{len(self)} knots, {len(self.symbols)} coordinates"
         return f"<Trajectory: {self.duration:g} s, {size}: {names}>"
 
+    def _repr_html_(self) -> str:
+        names = [str(symbol) for symbol in self.symbols]
+        times = np.linspace(0.0, self.duration, _SAMPLES)
+        curves = draw_curves(times, self.positions_at(times), names)
+        rows = [
+            (name, *map(format_number, (*column[[0, -1]], column.min(), column.max(), np.abs(speed).max())))
+            for name, column, speed in zip(names, self.positions.T, self.velocities.T, strict=True)
+        ]
+        caption = f"trajectory of {self.duration:.3g} s, {len(self)} knots [rad], [m]"
+        header = ("coordinate", "begin", "end", "least", "largest", "largest speed")
+        table = html_table(caption, header, rows)
+        return element("div", *([] if curves is None else [picture_element(curves, caption)]), table)
+
     @property
     def _arrays(self) -> tuple[Array, Array, Array]:
         # Adding 0 makes -0.0 and 0.0, which are equal, the same bytes.
@@ -333,6 +356,18 @@ class TrajectoryFollower:
     ----------
     tasks
         One goal for each coordinate.
+
+    Examples
+    --------
+    >>> model = kv.load("kitchen")
+    >>> door = model.symbol("kitchen/fridge_door")
+    >>> motion = kv.planning.time_parameterize([[0.0], [1.0]], 1.0, 2.0, symbols=[door])
+    >>> follower = kv.planning.TrajectoryFollower(motion)
+    >>> controller = kv.control.Controller(model, follower.tasks, dt=0.02, tier="interpreter")
+    >>> follower.set(controller, 0.75)
+    >>> command = controller.step(motion.at(0.75))
+    >>> round(command.speeds[door.derivative()], 2)
+    1.0
     """
 
     def __init__(
