@@ -295,9 +295,9 @@ def test_mappings_of_a_model_print_one_line_for_each_value() -> None:
             "  door: revolute from world to door, door",
             "  base: differentialdrive from world to base, base/x, base/y, base/angle",
         ],
-        "constraints": ["1 constraints:", "  door/position: 0 <= door <= 1.5"],
+        "constraints": ["1 constraint:", "  door/position: 0 <= door <= 1.5"],
         "bodies": ["0 bodies"],
-        "data": ["1 data:", "  colour: '<red>'"],
+        "data": ["1 datum:", "  colour: '<red>'"],
         "rates": [
             "3 rates:",
             "  base/x: (0.05*cos(base/angle)) · base/left_wheel:velocity + (0.05*cos(base/angle)) · base/right_w…",
@@ -332,7 +332,7 @@ def test_printing_is_bounded() -> None:
 def test_notebooks_show_tables() -> None:
     model = room()
     shown = model._repr_html_()
-    assert "<p>2 frames, 4 DoF, 1 constraints (version 1)</p>" in shown
+    assert "<p>2 frames, 4 DoF, 1 constraint (version 1)</p>" in shown
     assert "<summary>3 rates</summary>" in shown
     assert "&lt;red&gt;" in shown
     assert "<red>" not in shown

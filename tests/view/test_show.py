@@ -102,7 +102,7 @@ def test_a_real_script_ends_with_ctrl_c(hears_ctrl_c):
         out, err = script.communicate(timeout=60)
     assert "(Ctrl-C ends)" in said
     assert (script.returncode, err) == (0, "\n")
-    assert out.startswith("went on <page of <Model: 1 frames, 1 DoF")
+    assert out.startswith("went on <page of <Model: 1 frame, 1 DoF")
 
 
 def test_show_refuses_other_objects_and_leaves_no_thread():
