@@ -178,6 +178,7 @@ def test_a_mesh_of_a_server_is_asked_for_once(folder: Path) -> None:
 def test_a_loaded_library_outlives_its_file(folder: Path) -> None:
     q = kv.Symbol("q")
     f = kv.compile(q * q + 3, tier="c")
+    f.wait()
     assert clear_kind("libraries").files > 0
     assert measure_kind("libraries").files == 0
     assert f({"q": 2.0}) == 7.0
