@@ -15,9 +15,10 @@ import kineverse as kv
 import kineverse.geometry.decomposition.result as decompositions
 import kineverse.geometry.shapes as shapes
 import kineverse.planning.spheres.object_covers as covers
-from kineverse.cli.cache import format_age, format_bytes
+from kineverse.cli.cache import format_last_use
+from kineverse.cli.output import format_bytes
 from kineverse.compilation.cache import library_cache
-from kineverse.compilation.cache_kinds import KINDS, clear, measure
+from kineverse.compilation.cache_kinds import KINDS, clear_kind, measure_kind
 from kineverse.exchange import meshes
 from kineverse.exchange.meshes import FetchedFiles
 
@@ -82,7 +83,7 @@ def test_one_kind_is_cleared_and_the_others_stay(folder: Path, run) -> None:
     assert out.splitlines()[-1].startswith(f"2 files removed from {folder}, ")
     assert not any((folder / "zig").iterdir())
     assert CACHES["sphere_covers"].list_keys() == ["a" * 40]
-    assert {name for name in KINDS if measure(name).files} == {*KINDS} - {"sphere_trees", "zig"}
+    assert {name for name in KINDS if measure_kind(name).files} == {*KINDS} - {"sphere_trees", "zig"}
 
 
 def test_all_kinds_are_cleared(folder: Path, run) -> None:
@@ -137,7 +138,7 @@ def test_nonsense_is_answered_in_a_line_and_removes_nothing(folder: Path, run, w
     assert (status, out) == (2, "")
     assert said in err
     assert err.count("\n") == 1
-    assert all(measure(name).files == 1 for name in KINDS)
+    assert all(measure_kind(name).files == 1 for name in KINDS)
 
 
 @pytest.mark.parametrize("name", CACHES)
@@ -168,7 +169,7 @@ def test_a_mesh_of_a_server_is_asked_for_once(folder: Path) -> None:
     digest = sha256(content).hexdigest()
     assert [files.fetch(digest, len(content)) for _ in range(3)] == [content] * 3
     assert asked == [0, 300]
-    assert clear("meshes").files == 1
+    assert clear_kind("meshes").files == 1
     assert files.fetch(digest, len(content)) == content
     assert len(asked) == 4
 
@@ -177,8 +178,9 @@ def test_a_mesh_of_a_server_is_asked_for_once(folder: Path) -> None:
 def test_a_loaded_library_outlives_its_file(folder: Path) -> None:
     q = kv.Symbol("q")
     f = kv.compile(q * q + 3, tier="c")
-    assert clear("libraries").files > 0
-    assert measure("libraries").files == 0
+    f.wait()
+    assert clear_kind("libraries").files > 0
+    assert measure_kind("libraries").files == 0
     assert f({"q": 2.0}) == 7.0
 
 
@@ -192,7 +194,7 @@ def test_sizes_and_ages_are_read_at_a_glance() -> None:
         "512 MiB",
         "1 GiB",
     ]
-    assert [format_age(now - age) for age in (1, 130, 7300, 200_000)] == [
+    assert [format_last_use(now - age) for age in (1, 130, 7300, 200_000)] == [
         "now",
         "2 minutes ago",
         "2 hours ago",

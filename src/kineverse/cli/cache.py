@@ -8,10 +8,10 @@ import time
 from typing import Any
 
 from kineverse.compilation.cache import library_cache
-from kineverse.compilation.cache_kinds import KINDS, CacheUsage, clear, measure
+from kineverse.compilation.cache_kinds import KINDS, CacheUsage, clear_kind, measure_kind
 from kineverse.errors import UnknownNameError, suggest
 
-from .output import format_count, format_table
+from .output import format_bytes, format_count, format_table
 
 HELP = f"""\
 Compiled functions, hulls, sphere covers and meshes of model servers are kept in a folder of this user:
@@ -26,7 +26,6 @@ examples:
   kineverse cache --clear                     all kinds
   kineverse cache --clear libraries zig"""
 
-UNITS = ((2**30, "GiB"), (2**20, "MiB"), (2**10, "KiB"))
 PERIODS = ((86400, "day"), (3600, "hour"), (60, "minute"))
 
 
@@ -47,7 +46,7 @@ def run(arguments: argparse.Namespace) -> int:
             )
     is_cleared = arguments.clear is not None
     names = dict.fromkeys(arguments.clear or KINDS)
-    found = {name: clear(name) if is_cleared else measure(name) for name in names}
+    found = {name: clear_kind(name) if is_cleared else measure_kind(name) for name in names}
     files, size = sum(usage.files for usage in found.values()), sum(usage.bytes for usage in found.values())
     folder = library_cache().folder
     if arguments.json:
@@ -65,15 +64,7 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def format_bytes(size: int) -> str:
-    """Return a size with its unit: ``"45 MiB"``."""
-    for factor, unit in UNITS:
-        if size >= factor:
-            return f"{size / factor:.3g} {unit}" if size < 1000 * factor else f"{size / factor:.0f} {unit}"
-    return f"{size} B"
-
-
-def format_age(moment: float) -> str:
+def format_last_use(moment: float) -> str:
     """Return how long ago a moment [s since 1970] was, in whole days, hours or minutes."""
     age = max(time.time() - moment, 0.0)
     for seconds, unit in PERIODS:
@@ -86,7 +77,7 @@ def _format_row(name: str, usage: CacheUsage) -> tuple[str, ...]:
     limit = "none" if usage.kind.most_bytes is None else format_bytes(usage.kind.most_bytes)
     used = ""
     if usage.oldest is not None and usage.newest is not None:
-        oldest, newest = format_age(usage.oldest), format_age(usage.newest)
+        oldest, newest = format_last_use(usage.oldest), format_last_use(usage.newest)
         used = newest if oldest == newest else f"{oldest} to {newest}"
     return name, usage.kind.contents, str(usage.files), format_bytes(usage.bytes), limit, used
 

@@ -72,7 +72,7 @@ class CacheUsage:
     newest: float | None
 
 
-def measure(name: str) -> CacheUsage:
+def measure_kind(name: str) -> CacheUsage:
     """Return what the cache has of a kind; nothing is made or removed."""
     kind, folder = KINDS[name], library_cache().folder / KINDS[name].folder
     found = [status for _, status in _files(kind, folder)]
@@ -87,12 +87,12 @@ def measure(name: str) -> CacheUsage:
     )
 
 
-def clear(name: str) -> CacheUsage:
+def clear_kind(name: str) -> CacheUsage:
     """Remove all files of a kind, and return what has been removed.
 
     Processes that have loaded a file keep it.
     """
-    kind, before = KINDS[name], measure(name)
+    kind, before = KINDS[name], measure_kind(name)
     if not before.files:
         return before
     folder = _open(before.folder)
@@ -103,7 +103,7 @@ def clear(name: str) -> CacheUsage:
     else:
         for file, _ in _files(kind, before.folder):
             folder.remove(file)
-    after = measure(name)
+    after = measure_kind(name)
     return CacheUsage(
         kind,
         before.folder,
