@@ -22,23 +22,7 @@ from website.names import (
 from website.pages import find_documents
 from website.uses import find_users
 
-BASES = ", ".join(
-    (
-        "object",
-        "ABC",
-        "Protocol",
-        "Generic",
-        "Mapping",
-        "Sequence",
-        "Struct",
-        "Enum",
-        "BaseException",
-        "tuple",
-        "dict",
-        "str",
-        "int",
-    )
-)
+BASES = "object, ABC, Protocol, Generic, Mapping, Sequence, Struct, Enum, BaseException, tuple, str, int"
 """Classes of other people: what a class of ours has from them stands in their own documentation."""
 
 INTRODUCTION = (

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from .node import AccessListener, Node
 
 ExpressionLike: TypeAlias = "Expression | float | int | npt.ArrayLike | Sequence[Any]"
-"""What becomes an expression: numbers, arrays, expressions, and nested lists of these."""
+"""Values that become an expression: numbers, arrays, expressions, and nested lists of these."""
 
 NO_NODES: frozenset[Node] = frozenset()
 

@@ -15,6 +15,7 @@ import numpy.typing as npt
 from kineverse._extras import install_command
 from kineverse.errors import MissingDependencyError, ShapeError
 from kineverse.formats.files import replace_file
+from kineverse.model.kinematics import infer_units
 from kineverse.model.model_view import ModelView
 from kineverse.state import StateLike
 
@@ -24,7 +25,7 @@ from .camera import Camera
 from .drawables import Drawable, collect_drawables
 from .pictures import CLIP_SUFFIXES, draw_picture
 from .poses import FramePoses, complete
-from .sliders import Ranges, infer_units
+from .sliders import Ranges
 from .triangle_mesh import Floats
 
 SIZE = (640, 480)  # [pixels]
