@@ -275,7 +275,7 @@ def reach() -> np.ndarray:
 
 def open_a_door() -> np.ndarray:
     found = run_example("19_open_a_door", "--headless")
-    eye = Camera((-2.4, 1.6, 2.4), (0.6, -1.2, 0.8), field_of_view=0.55)
+    eye = Camera((0.1, 2.2, 2.0), (0.75, -1.35, 0.85), field_of_view=0.5)
     return picture(found["model"], found["state"], SIZE, eye)
 
 

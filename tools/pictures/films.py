@@ -63,7 +63,7 @@ FILMS = {
             {"garage/door": 0.0},
             {"garage/bolt": 0.0},
         ),
-        36,
+        30,
     ),
     "folding_door": there_and_back("door", 0.0, 1.84, 30),
     "door_with_handle": Film(
@@ -74,7 +74,7 @@ FILMS = {
             {"room/handle": 0.0},
             {"room/door": 0.0},
         ),
-        36,
+        30,
     ),
     "microwave": Film(
         (
@@ -84,7 +84,7 @@ FILMS = {
             {"oven/button": 0.0},
             {"oven/door": 0.0},
         ),
-        36,
+        30,
     ),
     "piston": turn("engine"),
     "pedal_bin": there_and_back("bin", 0.0, 0.17),
@@ -96,7 +96,7 @@ FILMS = {
             {"lamp/lower": 0.6, "lamp/upper": -0.4},
             {"lamp/lower": -0.3, "lamp/upper": -0.2},
         ),
-        33,
+        26,
     ),
     "ratchet": Film(
         (
@@ -106,7 +106,7 @@ FILMS = {
             {"winch/wheel": 0.0},
             {"winch/pawl": 0.0},
         ),
-        36,
+        30,
     ),
     "four_bar": turn("crank"),
     "slider_crank": turn("crank"),
@@ -120,9 +120,9 @@ FILMS = {
             {"motor_0": 0.0, "motor_1": 0.2, "motor_2": 0.7},
             {"motor_0": 0.2, "motor_1": 0.2, "motor_2": 0.2},
         ),
-        36,
+        30,
     ),
-    "jansen_leg": turn("crank", 36),
+    "jansen_leg": turn("crank", 28),
 }
 """Motions by name of the scene; the camera is that of its still."""
 

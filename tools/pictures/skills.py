@@ -49,14 +49,13 @@ def draw_kitchens() -> np.ndarray:
 def draw_shapes() -> np.ndarray:
     """Return a robot, and the shapes to which its distances are computed."""
     model = kv.load("fetch")
-    eye = Camera((2.1, 1.5, 1.2), (0.05, 0.0, 0.55), field_of_view=0.5)
-    return join_pictures([[picture(model, None, (238, 300), eye, collisions=c) for c in (False, True)]])
+    return join_pictures([[picture(model, None, (238, 260), collisions=c) for c in (False, True)]])
 
 
 def draw_fetch() -> np.ndarray:
     """Return a Fetch that has opened a fridge by the controller of an example."""
     found = run_example("19_open_a_door", "--headless", "fetch")
-    eye = Camera((-2.4, 1.6, 2.4), (0.6, -1.2, 0.8), field_of_view=0.55)
+    eye = Camera((0.1, 2.2, 2.0), (0.75, -1.35, 0.85), field_of_view=0.5)
     return picture(found["model"], found["state"], SIZE, eye)
 
 

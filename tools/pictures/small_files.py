@@ -13,6 +13,7 @@ from kineverse.view.clips import RATE, encode_clip
 
 LARGEST_SCENE, LARGEST = 24_000, 120_000  # [bytes]
 LARGEST_CLIP, LARGEST_TOUR = 300_000, 1_500_000
+TOUR_RATE = 8.0  # pictures per second
 QUALITIES = (75, 60, 45, 30)  # of clips; the first that is small enough is taken
 
 
@@ -31,9 +32,9 @@ def encode_small_picture(name: str, pixels: np.ndarray) -> bytes:
 
 def encode_small_clip(name: str, pictures: list[np.ndarray]) -> bytes:
     """Return a clip of as high a quality as fits."""
-    largest = LARGEST_TOUR if name == "open_close.webp" else LARGEST_CLIP
+    largest, rate = (LARGEST_TOUR, TOUR_RATE) if name == "open_close.webp" else (LARGEST_CLIP, RATE)
     for quality in QUALITIES:
-        data = encode_clip(pictures, ".webp", RATE, quality=quality, method=4, minimize_size=True)
+        data = encode_clip(pictures, ".webp", rate, quality=quality, method=4, minimize_size=True)
         if len(data) <= largest:
             break
     return data

@@ -13,8 +13,8 @@ from kineverse.view.clips import ClipMoment, draw_clip
 TOUR = {"kitchen/oven_door": 1.35, "kitchen/fridge_door": 1.35, "kitchen/sink_left_upper_drawer": 0.38}
 """Coordinates that are opened, and how far [rad], [m]."""
 
-EYE = Camera((-2.3, -2.9, 2.6), (0.55, 0.0, 0.75), field_of_view=0.72)
-SIZE, COUNT, REST = (860, 480), 88, 12  # of the pictures [pixels], their number, and that of the last one
+EYE = Camera((-2.5, -3.3, 2.8), (0.5, -0.3, 0.65), field_of_view=0.68)
+SIZE, COUNT, REST = (860, 460), 64, 8  # of the pictures [pixels], their number, and that of the last one
 PERIOD, LONGEST = 0.04, 400  # of the controller [s], and most steps of a phase
 FINGERS, OPEN, HOLDING, FINGER_SPEED = "hsr/hand_motor_joint", 1.0, 0.15, 1.5  # [rad], [rad/s]
 

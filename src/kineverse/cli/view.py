@@ -58,8 +58,8 @@ _NICENESS = 10  # of the page of a live system
 HELP = """\
 The page is served to this computer only, until Ctrl-C; with --host also to others, who need the address with
 its token. With --picture, a picture of the state is written instead (.png). This needs no browser, and no
-extra except for meshes and --near. As .webp or .gif it is a clip: of a recording, of a trajectory, or
-of all joints that move through their ranges, except those that --set names. Clips need the extra 'view'.
+extra except for meshes and --near. As .webp or .gif it is a clip: of a recording, of a trajectory, or of all
+joints that move through their ranges, except those that --set names. Clips need the extra 'view'.
 
 A recording of a run (.mcap) is played with a slider for its time: the truth, as a ghost what the robot
 believes, and as arrows what its controller wants. With --play, MODEL moves along a saved trajectory.

@@ -89,8 +89,8 @@ def sweep_ranges(
 ) -> list[ClipMoment]:
     """Return the moments of a motion of all coordinates through their ranges, as the page animates them.
 
-    Those of the names ``held`` stay at the values of the state. The end meets the beginning. Nothing that can
-    move makes the list empty.
+    Those of the names ``held`` stay at the values of the state. The end meets the beginning. The list is
+    empty if nothing can move.
     """
     values = complete(model, state)
     ranges = Ranges(model)

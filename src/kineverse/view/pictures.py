@@ -214,11 +214,11 @@ def _render(
     """Return (height, width, 3) display values of a scene on its ground."""
     image = draw_background(projection)
     if len(scene.corners):
-        points = scene.corners.reshape(-1, 3) if around is None else around
+        extent = scene.corners.reshape(-1, 3) if around is None else around
         seen, near = rasterize(projection, scene.corners, scene.closed, scene.colors[:, 3])
         away = np.subtract(camera.position, camera.target)
         beside = float(np.arctan2(away[1], away[0])) + 0.6
-        lamp = DirectionalLight.from_direction(scene.corners, beside, 0.85, points)
+        lamp = DirectionalLight.from_direction(scene.corners, beside, 0.85, extent)
         covered = np.flatnonzero(seen >= 0)
         if len(covered):
             triangle = seen[covered]
@@ -227,7 +227,7 @@ def _render(
             display = to_display(shade(colors, normals, lamp, lamp.lit_fraction(points, normals, covered)))
             display *= compute_outlines(scene.group[triangle], normals, near, covered, projection)[:, None]
             image[covered] = display
-        draw_ground(image, np.flatnonzero(seen < 0), points, projection, lamp)
+        draw_ground(image, np.flatnonzero(seen < 0), extent, projection, lamp)
     return image.reshape(projection.height, projection.width, 3)
 
 
