@@ -18,6 +18,7 @@ import shutil
 import subprocess
 import sys
 import tomllib
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from pathlib import Path
@@ -28,11 +29,12 @@ TABLE = re.compile(r"(?<=<!-- wheels -->\n).*?(?=<!-- end of wheels -->)", re.DO
 
 PYTHONS = ("3.11", "3.12", "3.13", "3.14")
 PLATFORMS = {
-    "Linux x86-64": "x86_64-manylinux_2_28",
-    "Linux ARM": "aarch64-manylinux_2_28",
+    "Linux x86-64": "x86_64-manylinux_2_34",
+    "Linux ARM": "aarch64-manylinux_2_34",
     "macOS ARM": "aarch64-apple-darwin",
     "Windows": "x86_64-pc-windows-msvc",
 }
+CORE = "the core"
 LEAST = "3.11.14"  # some pins refuse the first versions of 3.11
 MACOS = "14.0"  # the oldest macOS of the wheels that are counted
 
@@ -72,24 +74,32 @@ def pin(file: Path) -> str:
 def make_table() -> str:
     """Return the table of extras that can be installed from wheels alone, by Python and platform."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
-    extras = [None, *(extra for extra in project["optional-dependencies"] if extra != "all")]
-    asked = [(extra, platform, python) for extra in extras for platform in PLATFORMS for python in PYTHONS]
+    extras = [CORE, *(extra for extra in project["optional-dependencies"] if extra != "all")]
+    cases = [(platform, python) for platform in PLATFORMS for python in PYTHONS]
     with ThreadPoolExecutor(4) as pool:  # the index answers slowly, and uv waits
-        found = dict(zip(asked, pool.map(lambda case: has_wheels(*case), asked), strict=True))
+        found = dict(zip(cases, pool.map(lambda case: find_with_wheels(extras, *case), cases), strict=True))
     rows = [["extra", *PLATFORMS], ["---"] * (1 + len(PLATFORMS))]
     for extra in extras:
-        cells = [_span([p for p in PYTHONS if found[extra, platform, p]]) for platform in PLATFORMS]
-        rows.append([f"`{extra}`" if extra else "the core", *cells])
+        cells = [_span([p for p in PYTHONS if extra in found[platform, p]]) for platform in PLATFORMS]
+        rows.append([CORE if extra == CORE else f"`{extra}`", *cells])
     return "".join(f"| {' | '.join(row)} |\n" for row in rows)
 
 
-def has_wheels(extra: str | None, platform: str, python: str) -> bool:
-    """Return True if the newest versions that fit each other have wheels, with all that they need."""
+def find_with_wheels(extras: Sequence[str], platform: str, python: str) -> set[str]:
+    """Return the extras whose newest versions that fit each other have wheels, with all that they need.
+
+    Extras that can be installed together can be installed alone.
+    """
     where = ["--only-binary", ":all:", "--python-platform", PLATFORMS[platform], "--python-version", python]
-    answer = ask("pyproject.toml", *where, *(["--extra", extra] if extra else []))
-    if answer.returncode and "No solution found" not in answer.stderr:
+    named = [word for extra in extras if extra != CORE for word in ("--extra", extra)]
+    answer = ask("pyproject.toml", *where, *named)
+    if not answer.returncode:
+        return {*extras}
+    if "No solution found" not in answer.stderr:
         sys.exit(answer.stderr.strip())
-    return not answer.returncode
+    half = len(extras) // 2
+    parts = (extras[:half], extras[half:]) if half else ()
+    return set().union(*(find_with_wheels(part, platform, python) for part in parts))
 
 
 def ask(*words: str, said: str | None = None) -> subprocess.CompletedProcess[str]:

@@ -28,7 +28,7 @@ FOLDER = Path(__file__).resolve().parents[1] / "examples" / "notebooks"
 
 TIMEOUT = 300  # longest time of a cell [s]; the slowest takes three
 
-_METADATA = {
+METADATA = {
     "kernelspec": {"display_name": "Python 3", "language": "python", "name": "python3"},
     "language_info": {"name": "python"},
 }
@@ -66,13 +66,18 @@ def run_notebook(notebook: Any, kernel: KernelManager) -> Any:
 
     The kernel forgets all names first.
     """
-    reset = nbformat.v4.new_code_cell("%reset -f")
+    reset = nbformat.v4.new_code_cell("")
     new = nbformat.v4.new_notebook(cells=[reset, *(nbformat.from_dict(dict(c)) for c in notebook.cells)])
     with tempfile.TemporaryDirectory() as folder:
-        reset.source += f"\nimport os; os.chdir({folder!r})"
-        NotebookClient(new, km=kernel, timeout=TIMEOUT, record_timing=False).execute()
+        reset.source = f"import os\nos.chdir({folder!r})\n%reset -f"
+        client = NotebookClient(new, km=kernel, timeout=TIMEOUT, record_timing=False)
+        try:
+            client.execute()
+        finally:
+            if client.kc is not None:
+                client.kc.stop_channels()
     new.cells = new.cells[1:]
-    new.metadata = nbformat.from_dict(_METADATA)
+    new.metadata = nbformat.from_dict(METADATA)
     count = 0
     for cell in new.cells:
         cell.metadata = nbformat.from_dict({})

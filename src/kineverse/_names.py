@@ -26,26 +26,10 @@ def matches_pattern(name: str, patterns: Iterable[str]) -> bool:
 def match_names(given: Any, known: Iterable[str], what: str, argument: str = "") -> tuple[str, ...]:
     """Return the known names that a name, a pattern or several of them stand for, in the order given.
 
-    A pattern stands for its matches in the order of the known names. A name that contains wildcards itself is
-    found as well.
-
-    Parameters
-    ----------
-    given
-        A text, an object with the text of a name, such as a symbol, or an iterable of them.
-    known
-        The names that there are.
-    what
-        The noun for them.
-    argument
-        The beginning of messages, such as ``fixed=`` or ``--still``.
-
-    Raises
-    ------
-    UnknownNameError
-        For a name that is not known, or a pattern that matches none, with the nearest names or patterns.
-    InvalidValueError
-        For what is no name at all, such as a number.
+    A pattern stands for its matches in the order of the known names; a name that contains wildcards itself is
+    found as well. Given are a text, an object with the text of a name, such as a symbol, or several of them.
+    ``what`` is the noun for the names, and ``argument``, such as ``fixed=`` or ``--still``, begins messages.
+    What leads to nothing is an UnknownNameError with the nearest names or patterns.
     """
     names = dict.fromkeys(known)
     found: dict[str, None] = {}

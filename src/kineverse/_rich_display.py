@@ -42,10 +42,7 @@ def html_table(
 ) -> Html:
     """Return a table of texts, which are escaped; long texts and further rows are cut, with an ellipsis.
 
-    Parameters
-    ----------
-    total
-        Number of all rows, if ``rows`` are only the first ones.
+    ``total`` is the number of all rows, if ``rows`` are only the first ones.
     """
     shown = list(islice(rows, ROWS + 1))
     if total is None:

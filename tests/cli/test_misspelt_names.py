@@ -16,7 +16,7 @@ DOOR = ("--robot", "hsr", "--what", "kitchen/fridge_door")
         ("inof kitchen", "info"),
         ("info kitchen --jsno", "--json"),
         ("open kitchen --robbot hsr", "--robot"),  # and not that --robot is missing
-        ("--verbos info", "--verbose"),
+        ("--verbsoe info kitchen", "--verbose"),
         ("info kithcen", "kitchen"),
         ("info articulations/scrw", "articulations/screw"),
         ("unlock lockboxes/thesi --goal lockbox/a=1.2", "lockboxes/thesis"),

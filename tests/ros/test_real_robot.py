@@ -81,7 +81,7 @@ def test_a_skill_moves_an_object_through_topics_alone(ros_python, tmp_path, monk
 @pytest.mark.parametrize("robot", ["hsr", "pr2", "fetch"])
 def test_shipped_robots_open_a_kitchen_through_topics_alone(ros_python, robot, what):
     answer = run_robot(ros_python, "open", "kitchen", robot, what, "--seconds", "120")
-    assert answer["done"], answer["reason"]
+    assert answer.get("done"), answer.get("reason", answer["said"])
     assert answer["true"] == pytest.approx(answer["target"], abs=answer["measures"]["tolerance"])
 
 

@@ -42,7 +42,7 @@ class CommandModule(Protocol):
 COMMANDS: Mapping[str, tuple[str, str]] = MappingProxyType(
     {
         "info": ("info", "print the contents of a model: frames, degrees of freedom, constraints, size"),
-        "fk": ("fk", "print the pose of a frame at given positions"),
+        "fk": ("info:FK", "print the pose of a frame at given positions"),
         "reach": ("reach", "find positions in which a frame has a pose: inverse kinematics"),
         "plan": ("plan", "find a path without collisions"),
         "unlock": ("unlock", "find the order in which locked parts have to move"),
@@ -80,6 +80,7 @@ COMMANDS: Mapping[str, tuple[str, str]] = MappingProxyType(
         "undo": ("exchange:UNDO", "take back a commit of a served model"),
         "dump": ("exchange:DUMP", "write a backup of a served model, or a document of it"),
         "apply": ("exchange:APPLY", "add the operations of a file to a served model"),
+        "cache": ("cache", "print what is kept on the disk to be fast, and remove it"),
         "live": (
             "live_system",
             "let a robot open and close a kitchen, live: world, estimators, behaviour, page",

@@ -1,17 +1,18 @@
-"""``kineverse info``: contents of a model, and the list of articulations."""
+"""``kineverse info`` and ``fk``: contents of a model, the list of articulations, the pose of a frame."""
 
 from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+import kineverse as kv
 from kineverse import formats, gallery
-from kineverse.errors import KineverseError
+from kineverse.errors import InvalidValueError, KineverseError
 from kineverse.expressions.printing import format_number
 from kineverse.formats import shipped_models
 from kineverse.formats.file_formats import DOCUMENT_SUFFIXES
@@ -21,14 +22,22 @@ from kineverse.geometry import DistanceResult, Scene
 from kineverse.geometry.exclusions import find_unusable_shapes, is_installed
 from kineverse.geometry.objects import bodies_with_visual_collision
 from kineverse.geometry.shapes import import_coal
+from kineverse.lie import to_quaternion
 from kineverse.model.constraint import Constraint
 from kineverse.model.display import DofSummary, order_depth_first, summarize_freedoms
 from kineverse.model.model_view import ModelView
 from kineverse.reasoning import Interlocks, interlocks
 from kineverse.view.drawables import collect_drawables
-from kineverse.view.poses import FramePoses, complete
+from kineverse.view.poses import FramePoses, complete, roll_pitch_yaw
 
-from .arguments import add_model_options, load_model
+from .arguments import (
+    add_model_options,
+    add_set_option,
+    find_limit_notes,
+    load_model,
+    parse_assignments,
+    print_notes,
+)
 from .output import format_count, format_table, truncate_lines
 
 if TYPE_CHECKING:
@@ -290,3 +299,80 @@ def _format_bound(expression: object) -> str:
         return f"{float(text) + 0.0:.4g}"  # no minus before a zero
     except ValueError:
         return text
+
+
+# -- pose of a frame -----------------------------------------------------------------------------------------
+
+
+class PoseCommand(NamedTuple):
+    """Command that prints the pose of a frame."""
+
+    HELP: str
+    add_arguments: Callable[[argparse.ArgumentParser], None]
+    run: Callable[[argparse.Namespace], int]
+
+
+def _add_fk_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("model", metavar="MODEL", help="name of a shipped model, or path of a file")
+    parser.add_argument("frame", metavar="FRAME", help="name of a frame, such as kitchen/fridge_door")
+    parser.add_argument("--relative-to", metavar="FRAME", default="world", help="reference frame (world)")
+    add_set_option(parser)
+    add_model_options(parser)
+    parser.add_argument("--json", action="store_true", help="one JSON object on standard output")
+
+
+def _run_fk(arguments: argparse.Namespace) -> int:
+    """Evaluate the pose and print it."""
+    # Parsed before the model is loaded, so that a typing error is reported at once.
+    assigned = parse_assignments(arguments.assignments)
+
+    model = load_model(arguments, arguments.model)
+    expression = model.fk(arguments.frame, arguments.relative_to)
+    values = complete(model, assigned)
+    pose = np.asarray(expression(kv.State(values)), dtype=float)
+    notes = find_limit_notes(model, values, arguments.assignments)
+    used = {str(s): values[str(s)] for s in expression.symbols if str(s) in values}
+    if not np.isfinite(pose).all():
+        print_notes(notes)
+        where = ", ".join(f"{name}={format_number(value, 6)}" for name, value in used.items()) or "all values"
+        raise InvalidValueError(
+            f"The pose of '{arguments.frame}' in '{arguments.relative_to}' is not finite at {where}; "
+            "set other positions with --set."
+        )
+    position, rpy = pose[:3, 3], roll_pitch_yaw(pose)
+    xyzw = to_quaternion(pose[:3, :3])
+    if arguments.json:
+        answer = {
+            "frame": arguments.frame,
+            "relative_to": arguments.relative_to,
+            "transform": pose.tolist(),
+            "position": position.tolist(),
+            "quaternion_xyzw": xyzw.tolist(),
+            "roll_pitch_yaw": rpy.tolist(),
+            "depends_on": used,
+        }
+        print(json.dumps(answer, allow_nan=False))
+    else:
+        print(f"{arguments.frame} in {arguments.relative_to}")
+        print("\n".join("  " + "".join(f"{format_number(x, 6):>12}" for x in row) for row in pose))
+        rows = ("position", position, "m"), ("roll pitch yaw", rpy, "rad"), ("quaternion xyzw", xyzw, "")
+        for name, numbers, unit in rows:
+            cells = "".join(f"{format_number(x, 6):>12}" for x in numbers)
+            print(f"  {name:<16}{cells}  {unit}".rstrip())
+        if used:
+            print("  at " + ", ".join(f"{name}={format_number(value, 6)}" for name, value in used.items()))
+    print_notes(notes)
+    return 0
+
+
+FK = PoseCommand(
+    """\
+Positions that are not set have their defaults: 0, or the nearest value within the limits.
+
+examples:
+  kineverse fk kitchen kitchen/fridge_door_handle
+  kineverse fk kitchen kitchen/fridge_door_handle --set kitchen/fridge_door=30deg --json
+  kineverse fk pr2 pr2/l_gripper_tool_frame --relative-to pr2/torso_lift_link""",
+    _add_fk_arguments,
+    _run_fk,
+)

@@ -12,7 +12,7 @@ import kineverse as kv
 from kineverse.control import Goal, InverseKinematics, same_pose, same_position
 from kineverse.errors import InvalidValueError
 from kineverse.expressions.printing import format_number
-from kineverse.view.sliders import infer_units
+from kineverse.model.kinematics import infer_units
 
 from .arguments import (
     add_model_options,

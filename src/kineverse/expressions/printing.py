@@ -88,15 +88,9 @@ def expression_latex(expression: Expression) -> str:
 
 
 def gradient_latex(gradient: Mapping[Symbol, Expression], trends: frozenset[Symbol] = frozenset()) -> str:
-    """Return the entries of a gradient, each said to be exact or a trend.
-
-    Parameters
-    ----------
-    trends
-        Keys whose entries are trends.
-    """
+    """Return the entries of a gradient, each said to be exact or, for some keys, a trend."""
     if not gradient:
-        return r"D = \left\{\right\}"
+        return r"\text{no entries}"
     for limit in (_LONGEST_FORMULA // 4, 200, 50):
         writer, lines = _Latex(limit), []
         for speed, entry in islice(gradient.items(), _ENTRIES):

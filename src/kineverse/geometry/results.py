@@ -35,7 +35,7 @@ class DistanceResult:
 
     See Also
     --------
-    kineverse.geometry.Scene.distance
+    kineverse.geometry.Scene
     """
 
     a: str

@@ -64,6 +64,10 @@ class Grasp:
     clearance
         Least distance of the hand to everything but the bar, while it approaches and closes [m]: at most
         50 mm.
+
+    See Also
+    --------
+    kineverse.grasping.sample_grasps
     """
 
     gripper: Gripper
@@ -123,6 +127,16 @@ def sample_grasps(
     ------
     InvalidValueError
         If the bar is thicker than the gripper opens, or too near to its panel for the fingers.
+
+    Examples
+    --------
+    >>> model = kv.load("fetch")
+    >>> tags = model.include("kitchen")
+    >>> gripper = kv.grasping.find_gripper(model, "fetch")
+    >>> handle = kv.grasping.find_handle(model, "kitchen/fridge_door")
+    >>> grasps = kv.grasping.sample_grasps(model, gripper, handle, count=4)
+    >>> len(grasps), grasps[0].clearance > 0
+    (4, True)
     """
     if handle.thickness + _SLACK > gripper.width:
         raise InvalidValueError(

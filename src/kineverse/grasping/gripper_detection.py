@@ -52,6 +52,10 @@ class Gripper:
     remarks
         Shapes that cannot be read, and why. Without any shape, a finger is where its frames are: then the
         width and the grasp pose are rough.
+
+    See Also
+    --------
+    kineverse.grasping.find_gripper
     """
 
     robot: str
@@ -96,6 +100,11 @@ def find_grippers(model: ModelView, robot: str, srdf: Srdf | None = None) -> tup
         Prefix of the robot in the model; empty for a model without prefix.
     srdf
         Semantic description, whose end effectors come first.
+
+    Examples
+    --------
+    >>> [gripper.hand for gripper in kv.grasping.find_grippers(kv.load("pr2"), "pr2")]
+    ['pr2/r_gripper_palm_link', 'pr2/l_gripper_palm_link']
     """
     return _search(model, robot, srdf)[0]
 
@@ -114,6 +123,12 @@ def find_gripper(model: ModelView, robot: str, hand: str | None = None, srdf: Sr
     ------
     UnknownNameError
         If the robot has no gripper, or none at this frame; the message lists the grippers.
+
+    Examples
+    --------
+    >>> gripper = kv.grasping.find_gripper(kv.load("fetch"), "fetch")
+    >>> gripper.hand, round(gripper.width, 3)
+    ('fetch/gripper_link', 0.102)
     """
     result, why = _search(model, robot, srdf)
     name = f"The robot '{robot}'" if robot else "The model"

@@ -46,6 +46,10 @@ class Handle:
         Index of the bar among the shapes of the body.
     is_visual
         True if the body has visual shapes alone: the bar is then taken from these.
+
+    See Also
+    --------
+    kineverse.grasping.find_handle
     """
 
     frame: str
@@ -86,6 +90,12 @@ def find_handles(
         Coordinate of a door, a drawer or any other mechanism.
     decomposed
         Bodies, or patterns, as for :class:`kineverse.geometry.Scene`: without them a mesh is its convex hull.
+
+    Examples
+    --------
+    >>> model = kv.load("kitchen")
+    >>> [handle.frame for handle in kv.grasping.find_handles(model, "kitchen/oven_door")]
+    ['kitchen/oven_door_handle']
     """
     return _search(model, coordinate, decomposed)[0]
 
@@ -99,6 +109,12 @@ def find_handle(
     ------
     UnknownNameError
         If there is none; the message says which bodies the coordinate moves and why none is a handle.
+
+    Examples
+    --------
+    >>> handle = kv.grasping.find_handle(kv.load("kitchen"), "kitchen/fridge_door")
+    >>> handle.frame, round(handle.length, 2)
+    ('kitchen/fridge_door_handle', 0.6)
     """
     result, why = _search(model, coordinate, decomposed)
     if frame is not None:

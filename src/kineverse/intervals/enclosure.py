@@ -54,7 +54,12 @@ _ATTEMPTS = 4
 
 
 class Enclosures:
-    """Evaluation of terms over intervals."""
+    """Evaluation of terms over intervals.
+
+    See Also
+    --------
+    kineverse.intervals.enclose_bound
+    """
 
     def __init__(self, terms: TermGraph) -> None:
         self._terms = terms
@@ -323,6 +328,12 @@ def enclose_bound(bound: Expression, box: Mapping[Symbol, RealInterval]) -> Real
     """Return the range of a scalar where its symbols are in a box, to 14 digits and rather too wide.
 
     Symbols that the box lacks are anywhere. The range is infinite if nothing is known about it.
+
+    Examples
+    --------
+    >>> x = kv.position("x")
+    >>> kv.intervals.enclose_bound(x**2 - x, {x: (0.0, 1.0)})
+    (-0.265625, 0.015625)
     """
     terms = TermGraph({s: s.value for s in bound.symbols if s.value is not None})
     root, enclosures = terms.term(bound), Enclosures(terms)

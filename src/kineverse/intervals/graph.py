@@ -52,7 +52,12 @@ class Term:
 
 
 class TermGraph:
-    """The terms of one or more expressions."""
+    """The terms of one or more expressions.
+
+    See Also
+    --------
+    kineverse.intervals.enclose_bound
+    """
 
     def __init__(self, constants: Mapping[Symbol, float]) -> None:
         self._given = constants

@@ -76,6 +76,10 @@ class BehaviourProcess:
         Prefix of the robot's names.
     make
         Function that makes the behaviour of sessions and of a function that gets its notes.
+
+    See Also
+    --------
+    kineverse.live.WorldProcess
     """
 
     def __init__(

@@ -128,6 +128,10 @@ class Behaviour:
         What it does, and why, with the results so far.
     is_done
         Whether nothing is left to do, for ever.
+
+    See Also
+    --------
+    kineverse.live.WorldProcess
     """
 
     name = ""

@@ -36,6 +36,10 @@ class LearnerProcess:
         Frames, or patterns, of the parts whose joints are unknown, as for :class:`.ModelEstimator`.
     asks
         Whether operations that the model has are replaced only after somebody has accepted that.
+
+    See Also
+    --------
+    kineverse.live.ModelEstimator
     """
 
     def __init__(self, live: LiveModel, parts: Iterable[str] = (), *, asks: bool = False) -> None:

@@ -129,6 +129,10 @@ class LivePage(Closing):
         Page of the served model.
     live
         The served model.
+
+    See Also
+    --------
+    kineverse.live.WorldProcess
     """
 
     def __init__(self, page: Viewer, live: LiveModel) -> None:

@@ -70,6 +70,10 @@ class LiveRobot:
         If it has another robot.
     DuplicateNameError
         If another process sends commands already.
+
+    See Also
+    --------
+    kineverse.live.WorldProcess
     """
 
     remarks: tuple[str, ...] = ()
@@ -219,7 +223,12 @@ class LiveRobot:
 
 
 class LiveBelief:
-    """Belief that a tracker of a live system publishes."""
+    """Belief that a tracker of a live system publishes.
+
+    See Also
+    --------
+    kineverse.live.WorldProcess
+    """
 
     def __init__(self, robot: LiveRobot) -> None:
         self._robot, self._model = robot, robot.model

@@ -43,6 +43,10 @@ class TrackerProcess:
         Prefix of the robot's names.
     sensors
         The noise to expect.
+
+    See Also
+    --------
+    kineverse.live.WorldProcess
     """
 
     def __init__(self, live: LiveModel, robot: str, sensors: Sensors) -> None:

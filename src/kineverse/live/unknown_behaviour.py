@@ -54,6 +54,12 @@ def make_unknown_scene(truth: Model, what: str, state: State | None = None) -> U
     ------
     UnknownNameError, InvalidValueError
         If there is no such coordinate, or no joint of its own moves a part, or the part has no handle.
+
+    Examples
+    --------
+    >>> scene = kv.live.make_unknown_scene(kv.load("shelf_door"), "shelf_door/door")
+    >>> scene.model.degrees_of_freedom
+    ()
     """
     coordinate = truth.symbol(what)
     part = next((a.child for a in truth.articulations.values() if coordinate in a.coordinates), None)
@@ -67,7 +73,12 @@ def make_unknown_scene(truth: Model, what: str, state: State | None = None) -> U
 
 
 class OpenUnknown(Behaviour):
-    """Behaviour that opens parts without a joint, waits for the learner, closes them by name, and ends."""
+    """Behaviour that opens parts without a joint, waits for the learner, closes them by name, and ends.
+
+    See Also
+    --------
+    kineverse.live.make_unknown_scene
+    """
 
     name = "unknown"
     overlap = 0.01  # a joint that was learned is off by millimetres

@@ -86,6 +86,21 @@ class WorldProcess:
         The present world.
     stopped
         Why the robot takes no commands; empty if it does.
+
+    Examples
+    --------
+    >>> model = kv.load("fetch")
+    >>> server = kv.exchange.serve(model, name="doc-world")
+    >>> live = kv.load(server.address)
+    >>> make = lambda model: kv.worlds.KinematicWorld(model, "fetch")
+    >>> process = kv.live.WorldProcess(live, make, model.default_state())
+    >>> process.tick(0.02)
+    >>> process.stop("a person is near")
+    >>> process.stopped
+    'a person is near'
+    >>> process.close()
+    >>> live.close()
+    >>> server.close()
     """
 
     def __init__(

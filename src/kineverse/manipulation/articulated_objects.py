@@ -41,6 +41,10 @@ class ArticulatedObject:
         Limit nearest to the default value [m], [rad].
     opened
         The other limit [m], [rad].
+
+    See Also
+    --------
+    kineverse.manipulation.find_articulated_objects
     """
 
     coordinate: Symbol
@@ -65,6 +69,12 @@ def find_articulated_objects(
         Without the extra ``geometry``.
     UnknownNameError
         If nothing of the model that moves is below the prefix.
+
+    Examples
+    --------
+    >>> found = kv.manipulation.find_articulated_objects(kv.load("shelf_door"))
+    >>> [(one.coordinate, one.kind) for one in found]
+    [(shelf_door/door, 'door')]
     """
     known = None if robot is None else Robot.of(model, robot)
     free = [s for s in model.degrees_of_freedom if known is None or not known.moves(s)]

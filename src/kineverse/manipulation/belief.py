@@ -145,6 +145,17 @@ class TrackedBelief:
     ------
     InvalidValueError
         If no marked frame moves with an object, or odometry drifts under a base that is not planar.
+
+    Examples
+    --------
+    >>> model = kv.load("fetch")
+    >>> tags = model.include("kitchen")
+    >>> world = kv.worlds.KinematicWorld(model, "fetch", sensors=kv.worlds.Sensors.parse("3mm,0.5deg"))
+    >>> world.reset(model.default_state() | {"kitchen/fridge_door": 0.3})
+    >>> belief = kv.manipulation.TrackedBelief(model, "fetch", kv.worlds.Sensors.parse("3mm,0.5deg"))
+    >>> state = belief.update(world.observe(), world.time)
+    >>> abs(state["kitchen/fridge_door"] - 0.3) < 0.05
+    True
     """
 
     def __init__(self, model: ModelView, robot: Robot | str, sensors: Sensors | None = None) -> None:

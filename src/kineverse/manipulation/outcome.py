@@ -30,6 +30,10 @@ class Outcome:
     measures
         Further figures by name; ``failure`` is the kind of what prevented it: ``"collision"``, ``"reach"``,
         ``"time"`` or ``"other"``.
+
+    See Also
+    --------
+    kineverse.manipulation.open_object
     """
 
     done: bool
@@ -53,6 +57,10 @@ class SkillError(KineverseError):
         ``"collision"``, ``"reach"``, ``"time"`` or ``"other"``.
     measures
         Figures of the failure, which the outcome gets.
+
+    See Also
+    --------
+    kineverse.manipulation.SkillRun
     """
 
     def __init__(self, kind: str, reason: str, measures: Mapping[str, Any] | None = None) -> None:

@@ -48,6 +48,10 @@ class PlacedRobot:
         Values of these at the place where it was put; none if it was put nowhere in particular.
     source
         Name or path of its description.
+
+    See Also
+    --------
+    kineverse.manipulation.place_robot
     """
 
     name: str
@@ -124,6 +128,15 @@ def place_robot(
         be moved to such a place. The model is unchanged then.
     KineverseError
         If the description cannot be read.
+
+    Examples
+    --------
+    >>> scene = kv.load("shelf_door")
+    >>> robot = kv.manipulation.place_robot(scene, "hsr", at=(-1.0, 0.0, 0.0))
+    >>> robot.name, robot.base
+    ('hsr', (hsr/base/x, hsr/base/y, hsr/base/angle))
+    >>> robot.start_state(scene)["hsr/base/x"]
+    -1.0
     """
     source = os.fspath(robot)
     if prefix != "":

@@ -80,7 +80,12 @@ class HandReference:
 
 
 class Belief(Protocol):
-    """Source of the state that a controller uses."""
+    """Source of the state that a controller uses.
+
+    See Also
+    --------
+    kineverse.worlds.TrueBelief
+    """
 
     def update(self, observation: Observation, time: float, commands: State | None = None) -> State:
         """Return the believed state of all coordinates after a step; its stamp is a time of the robot [s].
@@ -191,6 +196,17 @@ class Session:
     InvalidValueError
         For a time of a step, a time-out or a patience that is not positive, and for steps that are longer
         than the interface's own time-out, after which it stops the robot.
+
+    Examples
+    --------
+    >>> world = kv.worlds.KinematicWorld(kv.load("fetch"), "fetch")
+    >>> world.reset({"fetch/torso_lift_joint": 0.1})
+    >>> session = kv.manipulation.Session(world, belief=kv.worlds.TrueBelief(world), dt=0.02)
+    >>> for _ in range(10):
+    ...     session.act({kv.velocity("fetch/torso_lift_joint"): 0.05})
+    >>> session.stop()
+    >>> round(session.state["fetch/torso_lift_joint"], 2), session.steps
+    (0.11, 11)
     """
 
     def __init__(

@@ -46,6 +46,20 @@ class SkillRun:
         Figures by name, which the outcome gets.
     until
         Time at which the time is up [s].
+
+    Examples
+    --------
+    >>> from kineverse.manipulation import SkillRun
+    >>> world = kv.worlds.KinematicWorld(kv.load("fetch"), "fetch")
+    >>> session = kv.manipulation.Session(world, belief=kv.worlds.TrueBelief(world))
+    >>> run = SkillRun(session, kv.position("fetch/torso_lift_joint"), seconds=5)
+    >>> def lift():
+    ...     while run.value < 0.05:
+    ...         run.act({kv.velocity("fetch/torso_lift_joint"): 0.1})
+    ...     return "the torso is up"
+    >>> outcome = run.perform(lift)
+    >>> outcome.done, outcome.reason
+    (True, 'the torso is up')
     """
 
     def __init__(self, session: Session, coordinate: Symbol | None, seconds: float) -> None:

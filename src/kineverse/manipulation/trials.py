@@ -29,6 +29,10 @@ class JudgedOutcome(Outcome):
     ----------
     claimed
         Whether the skill believes that it is done.
+
+    See Also
+    --------
+    kineverse.manipulation.open_object
     """
 
     claimed: bool = False
@@ -46,6 +50,10 @@ def judge_outcome(outcome: Outcome, metrics: RunMetrics) -> JudgedOutcome:
     metrics
         Metrics of the run, with the coordinate of the object. Their measures are added, and the ``way`` and
         the ``turn`` of a part replace what the skill believes of them.
+
+    See Also
+    --------
+    kineverse.manipulation.open_object
     """
     value, overlap, objections = metrics.value, metrics.overlap, list[str]()
     measures = {**metrics.measures, **outcome.measures}
@@ -110,6 +118,10 @@ def stand_at_handle(
     -------
     bool
         Whether the world was reset.
+
+    See Also
+    --------
+    kineverse.manipulation.open_object
     """
     state = world.state
     opener = Opener.of(session.robot, gripper or session.robot.gripper(), state)

@@ -41,6 +41,12 @@ def format_line(value: object) -> str:
     return " ".join(_text(value).split())
 
 
+def count_values(count: int, kind: str) -> str:
+    """Return a number with the noun of a kind of values: ``1 constraint``, ``2 bodies``."""
+    noun = {"bodies": "body", "data": "datum"}.get(kind, kind.removesuffix("s"))
+    return f"{count} {noun if count == 1 else kind}"
+
+
 def _several(count: int, what: str) -> str:
     return f"{count} {what}{'' if count == 1 else 's'}"
 

@@ -28,6 +28,7 @@ from kineverse.symbols import Symbol, check_symbols, parse_symbol_name
 
 from . import registry
 from .constraint import TOLERANCE, Constraint, ConstraintLike, as_constraint
+from .display import count_values
 from .operation import ARTICULATIONS, CONSTRAINTS, map_expressions
 from .registry import SaveResult, SourceFile
 from .symbolic_view import SymbolicView, cached_for_version
@@ -630,8 +631,8 @@ class ModelView(SymbolicView):
 
     def __str__(self) -> str:
         return (
-            f"{len(self.frames)} frames, {len(self.degrees_of_freedom)} DoF, "
-            f"{len(self.constraints)} constraints (version {self.version})"
+            f"{count_values(len(self.frames), 'frames')}, {len(self.degrees_of_freedom)} DoF, "
+            f"{count_values(len(self.constraints), 'constraints')} (version {self.version})"
         )
 
     def __repr__(self) -> str:

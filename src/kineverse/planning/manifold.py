@@ -43,6 +43,10 @@ class FrameHold(Hold):
     ----------
     frames
         Names of both frames; what carries them may touch while the hold lasts.
+
+    See Also
+    --------
+    kineverse.planning.Planner.hold
     """
 
     frames: tuple[str, str] = field(default=("", ""), kw_only=True)

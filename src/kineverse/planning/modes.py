@@ -44,6 +44,10 @@ class Mode:
         Coordinates of objects that move in this mode, as symbols or names. An object that is named by some
         mode stands still in all others. Coordinates that no mode names, such as those of the robot, always
         move.
+
+    See Also
+    --------
+    kineverse.planning.Planner
     """
 
     name: str

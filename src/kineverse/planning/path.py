@@ -59,6 +59,10 @@ class Path:
         Of a path through modes, the name of each with the indices of its first and last point.
     sections
         Parts with checks of their own, at whose ends the trajectory rests; empty for a path that is one part.
+
+    See Also
+    --------
+    kineverse.planning.Planner
     """
 
     found: bool

@@ -88,6 +88,16 @@ class Planner:
         For names or patterns in ``move`` or ``rules`` that the model does not have.
     InvalidValueError
         If nothing moves, or a coordinate cannot move independently.
+
+    Examples
+    --------
+    >>> model = kv.load("shelf_door")
+    >>> planner = kv.planning.Planner(model, move=["shelf_door/door"])
+    >>> path = planner.plan({"shelf_door/door": 0.0}, {"shelf_door/door": 1.0})
+    >>> path.found, path.points[-1]
+    (True, array([1.]))
+    >>> path.trajectory().duration > 0
+    True
     """
 
     def __init__(
@@ -198,6 +208,12 @@ class Planner:
         """Return flags (N,) of configurations (N, n) that are within limits and free of collisions.
 
         Bodies that are nearer than 0.01 mm may count as touching.
+
+        Examples
+        --------
+        >>> planner = kv.planning.Planner(kv.load("shelf_door"), move=["shelf_door/door"])
+        >>> planner.valid([[0.5], [5.0]])
+        array([ True, False])
         """
         self._synchronize()
         points = self._configurations(Q, "Q")
@@ -242,6 +258,14 @@ class Planner:
         While it lasts, the bodies at and below both frames may touch each other; of a frame that never moves,
         only the body at it, or the next one above. They may not if one frame carries the other, as the world
         carries a hand that is kept upright.
+
+        Examples
+        --------
+        >>> model = kv.load("shelf_door")
+        >>> planner = kv.planning.Planner(model, move=["shelf_door/door"])
+        >>> hold = planner.hold("shelf_door/door_handle", "world", mask="x")
+        >>> hold.frames
+        ('shelf_door/door_handle', 'world')
         """
         for what, text in (("a", a), ("b", b), ("mask=", mask)):
             if not isinstance(text, str):
@@ -324,6 +348,10 @@ class Planner:
         ------
         InvalidValueError
             For an unknown method, or one that cannot do holds; for modes that are optimized.
+
+        See Also
+        --------
+        kineverse.planning.Planner
         """
         begin = perf_counter()
         scene = self._synchronize()

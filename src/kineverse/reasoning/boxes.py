@@ -20,6 +20,14 @@ class Interval:
     """Interval of real numbers with open or closed ends; infinite ends are open.
 
     ``x in interval`` tests whether a number lies in the interval.
+
+    Examples
+    --------
+    >>> narrow = kv.reasoning.Interval(0.0, 0.3, upper_closed=True)
+    >>> 0.3 in narrow, 0.0 in narrow
+    (True, False)
+    >>> narrow.describe("bolt")
+    '0 < bolt <= 0.3'
     """
 
     lower: Number = -math.inf
@@ -98,6 +106,13 @@ class IntervalBox(Mapping[Expression, Interval]):
     """Conjunction of conditions: intervals of coordinates, or of sums of coordinates; all others are free.
 
     The box without conditions covers the whole space.
+
+    Examples
+    --------
+    >>> bolt = kv.position("bolt")
+    >>> ajar = kv.reasoning.IntervalBox({bolt: kv.reasoning.Interval(0.0, 0.3)})
+    >>> ajar.covers(kv.reasoning.IntervalBox({bolt: kv.reasoning.Interval(0.1, 0.2)}))
+    True
     """
 
     __slots__ = ("_sides",)

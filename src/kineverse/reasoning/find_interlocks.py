@@ -158,6 +158,15 @@ def interlocks(model: ModelView, values: Mapping[Symbol | str, float] | None = N
         If ``model`` is no model.
     UnknownNameError, InvalidValueError
         If a value has an unknown name, or is NaN.
+
+    Examples
+    --------
+    >>> model = kv.Model()
+    >>> with model.edit() as edit:
+    ...     edit.apply(kv.articulations.GarageDoor(name="garage", parent="world"))
+    'garage door garage'
+    >>> kv.reasoning.interlocks(model)
+    <Interlocks: 1 found, 0 undecided>
     """
     if not isinstance(model, ModelView):
         raise ExpressionError(

@@ -36,6 +36,10 @@ class Interlock:
         Boxes, in each of which the restriction is active.
     lower, upper
         Range of a position, or its one value twice. Both may depend on other coordinates.
+
+    See Also
+    --------
+    kineverse.reasoning.interlocks
     """
 
     held: Expression
@@ -67,7 +71,12 @@ class Interlock:
 
 @dataclass(frozen=True)
 class Undecided:
-    """Constraint whose effect is unknown, with the reason and the region where it is unknown."""
+    """Constraint whose effect is unknown, with the reason and the region where it is unknown.
+
+    See Also
+    --------
+    kineverse.reasoning.interlocks
+    """
 
     constraint: str
     reason: str
@@ -78,7 +87,12 @@ class Undecided:
 
 
 class Interlocks(Sequence[Interlock]):
-    """Interlocks of a model, in the order of its constraints, and its ``undecided`` constraints."""
+    """Interlocks of a model, in the order of its constraints, and its ``undecided`` constraints.
+
+    See Also
+    --------
+    kineverse.reasoning.interlocks
+    """
 
     def __init__(self, found: Sequence[Interlock], undecided: Sequence[Undecided] = ()) -> None:
         self._found = tuple(found)
@@ -196,6 +210,13 @@ def opening_order(found: Interlocks, goal: Symbol | str) -> tuple[Symbol, ...]:
     ------
     ModelError
         If coordinates lock each other in a cycle, which the message lists.
+
+    Examples
+    --------
+    >>> model = kv.load("articulations/garage_door")
+    >>> found = kv.reasoning.interlocks(model)
+    >>> kv.reasoning.opening_order(found, "garage_door/garage/door")
+    (garage_door/garage/bolt, garage_door/garage/door)
     """
     start = goal if isinstance(goal, Symbol) else Symbol(goal)
     done: dict[str, Symbol] = {}

@@ -21,7 +21,14 @@ TINY, ANY, BOTH_SIDES = 1e-12, (-math.inf, math.inf), ("stands still", "has no v
 
 
 def contradictions(model: ModelView, found: Interlocks, points: int = 20, seed: int = 0) -> list[str]:
-    """Return claims that are wrong at a sample point, inside or outside of the boxes, and missing locks."""
+    """Return claims that are wrong at a sample point, inside or outside of the boxes, and missing locks.
+
+    Examples
+    --------
+    >>> model = kv.load("articulations/garage_door")
+    >>> kv.reasoning.contradictions(model, kv.reasoning.interlocks(model))
+    []
+    """
     given = model.constraints.items()
     rows = {n: Constraint(to_plain(c.lower), to_plain(c.expression), to_plain(c.upper)) for n, c in given}
     limits: _Limits = {}

@@ -47,6 +47,13 @@ def plan_violations(model: ModelView, plan: UnlockingPlan, state: StateLike | No
     ----------
     state
         Positions at the start, as they were given to the planner.
+
+    Examples
+    --------
+    >>> model = kv.load("articulations/garage_door")
+    >>> plan = kv.reasoning.plan_unlocking(model, {"garage_door/garage/door": 1.0})
+    >>> kv.reasoning.plan_violations(model, plan)
+    []
     """
     ranges = ConstraintRanges(model)
     point = start_point(model, state)
@@ -174,6 +181,10 @@ class InvariantSet:
         Products of cells, one range of them for each coordinate. The start is in one of them.
     following
         For each region the numbers of others to which moves lead from it.
+
+    See Also
+    --------
+    kineverse.reasoning.refutation_gaps
     """
 
     coordinates: tuple[Symbol, ...]
@@ -195,6 +206,15 @@ def refutation_gaps(model: ModelView, plan: UnlockingPlan, state: StateLike | No
     ----------
     state
         Positions at the start, as they were given to the planner.
+
+    Examples
+    --------
+    >>> model = kv.load("articulations/garage_door")
+    >>> bolt = "garage_door/garage/bolt"
+    >>> goal = {"garage_door/garage/door": 1.0}
+    >>> plan = kv.reasoning.plan_unlocking(model, goal, {bolt: 0.0}, fixed=[bolt])
+    >>> plan.verdict, kv.reasoning.refutation_gaps(model, plan, {bolt: 0.0})
+    ('refuted', [])
     """
     known = plan.invariant
     if known is None:

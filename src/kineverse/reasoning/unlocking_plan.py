@@ -39,6 +39,10 @@ class UnlockingStep:
         Position that has to be passed; None if the target is a goal.
     releases
         Interlocks that hold later moves unless this one is made.
+
+    See Also
+    --------
+    kineverse.reasoning.plan_unlocking
     """
 
     coordinate: Symbol
@@ -104,6 +108,10 @@ class UnlockingPlan:
         Reason why it is undecided.
     invariant
         Positions without the goal that no move of one coordinate at a time leaves, for a refutation.
+
+    See Also
+    --------
+    kineverse.reasoning.plan_unlocking
     """
 
     goal: Mapping[Symbol, float]
@@ -200,6 +208,13 @@ def plan_unlocking(
     InvalidValueError
         For a goal beyond its limits, no goal, a number that is not finite, a budget that is not positive, or
         a parameter in the state with another value than its own.
+
+    Examples
+    --------
+    >>> model = kv.load("articulations/garage_door")
+    >>> plan = kv.reasoning.plan_unlocking(model, {"garage_door/garage/door": 1.0})
+    >>> plan.verdict, [step.coordinate for step in plan.steps]
+    ('found', [garage_door/garage/bolt, garage_door/garage/door])
     """
     if not (isinstance(budget, int | float) and budget > 0):
         raise InvalidValueError(f"The budget of a plan is a positive time in seconds, not {budget!r}.")

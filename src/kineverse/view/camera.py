@@ -26,6 +26,12 @@ class Camera:
         The upward direction of the picture.
     field_of_view
         The angle between the upper and the lower edge of the picture [rad].
+
+    Examples
+    --------
+    >>> camera = kv.view.Camera(position=(3, -2, 2), target=(1, -1.5, 1))
+    >>> kv.view.picture(kv.load("shelf_door"), size=(64, 48), camera=camera).shape
+    (48, 64, 3)
     """
 
     position: tuple[float, float, float]

@@ -46,6 +46,23 @@ def draw_finding(model: ModelView, finding: MotionFinding) -> npt.NDArray[np.uin
     -------
     numpy.ndarray or None
         None if none of its bodies can be drawn.
+
+    Examples
+    --------
+    >>> block = kv.model.Shape(kv.model.Box((0.1, 0.1, 0.1)))
+    >>> body = kv.model.Body(visuals=(block,), collisions=(block,))
+    >>> model = kv.Model()
+    >>> with model.edit() as edit:
+    ...     edit.add_frame("wall", "world", kv.translation(0.3, 0, 0), body=body)
+    ...     edit.apply(kv.Prismatic(name="drawer", parent="world", child="slide", lower=0, upper=0.6))
+    ...     edit.add_frame("drawer", "slide", body=body)
+    'frame wall'
+    'joint drawer'
+    'frame drawer'
+    >>> report = kv.geometry.check_motion(model)
+    >>> finding = [*report.findings, *report.suspects][0]
+    >>> kv.view.draw_finding(model, finding).shape
+    (480, 640, 3)
     """
     moving = {body for body in finding.bodies if body in model.bodies}
     items = collect_drawables(model, "collision" if _has_collisions(model, moving) else "visual")

@@ -6,6 +6,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any
 
+import numpy as np
+
 from kineverse._rich_display import Html, element
 
 
@@ -87,7 +89,15 @@ def format_missing_meshes(problems: Sequence[str]) -> Html:
     return colored_box(_RED, _LIGHT_RED, element("b", f"{len(problems)} {noun} could not be loaded"), *lines)
 
 
+_NEGLIGIBLE = 1e-9  # what is smaller is 0: rounding of a file's units
+
+
 def format_significant(value: float) -> str:
     """Format a number with at most 4 significant digits and a legible minus sign."""
+    if abs(value) < _NEGLIGIBLE:
+        return "0"
+    # Exponents only where the digits would be many.
     text = f"{value:.4g}"
+    if "e" in text and 1e-6 <= abs(value) < 1e6:
+        text = np.format_float_positional(float(text), trim="-")
     return text.replace("-", "−").replace("inf", "∞")

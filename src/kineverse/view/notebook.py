@@ -54,14 +54,7 @@ def bundle_display(
 ) -> dict[str, str]:
     """Return the display of a model by MIME type: HTML with its page, its picture, and a plain text.
 
-    Parameters
-    ----------
-    plain
-        The text for front ends without pictures.
-    address
-        The address of the page; empty without one.
-    note
-        A line above the picture.
+    The address of the page is empty if there is none; the note is a line above the picture.
     """
     bundle = {"text/plain": plain}
     shown = Html()

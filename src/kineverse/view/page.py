@@ -124,6 +124,13 @@ def view(
     """Show a model on a web page and return at once; :func:`kineverse.show` waits, and opens the browser.
 
     Parameters, result and errors are those of :class:`kineverse.view.viewer.Viewer`.
+
+    Examples
+    --------
+    >>> with kv.view.view(kv.load("kitchen"), port=0) as page:
+    ...     page.move({"kitchen/fridge_door": 0.8})
+    ...     "http" in page.address
+    True
     """
     from .viewer import Viewer  # for start-up time
 

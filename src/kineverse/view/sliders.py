@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,12 @@ import kineverse as kv
 from kineverse.model.model_view import ModelView
 from kineverse.state import State
 
+from .html import format_significant
 from .poses import roll_pitch_yaw
+
+DEGREES = {"rad": ("°", math.degrees(1.0)), "rad/s": ("°/s", math.degrees(1.0))}
+CENTIMETRES = {"m": ("cm", 100.0), "m/s": ("cm/s", 100.0)}
+"""The other unit in which numbers may be shown, by unit, and the factor to it."""
 
 UNLIMITED_RANGE = {"rad": np.pi, "m": 2.0, "": 2.0}  # half of the range of a slider without limits [rad], [m]
 
@@ -79,6 +85,25 @@ class Ranges:
         for symbol in self._dependent:
             limits[str(symbol)] = self._model.limits(symbol, state)
         return limits
+
+
+@dataclass
+class DisplayUnits:
+    """Units in which the page shows numbers."""
+
+    degrees: bool = False  # instead of radians
+    centimetres: bool = False  # instead of metres
+
+    def scale(self, unit: str) -> tuple[float, str]:
+        """Return the factor from a unit of the model to the one that is shown, and the name of that."""
+        other = (DEGREES if self.degrees else {}) | (CENTIMETRES if self.centimetres else {})
+        name, factor = other.get(unit, (unit, 1.0))
+        return factor, name
+
+    def format(self, value: float, unit: str) -> str:
+        """Format a number that is given in a unit of the model."""
+        factor, name = self.scale(unit)
+        return f"{format_significant(factor * value)} {name}".rstrip()
 
 
 def choose_slider_range(

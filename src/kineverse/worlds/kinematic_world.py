@@ -54,7 +54,12 @@ _UNKNOWN_TRAVEL = 0.1
 
 
 class Event(NamedTuple):
-    """Something that happened in a world at a time [s], such as a hold that began."""
+    """Something that happened in a world at a time [s], such as a hold that began.
+
+    See Also
+    --------
+    kineverse.worlds.KinematicWorld
+    """
 
     time: float
     text: str
@@ -98,6 +103,17 @@ class KinematicWorld:
         If the model has no such robot, or no constraint of a name.
     InvalidValueError
         For parameters out of their range.
+
+    Examples
+    --------
+    >>> model = kv.load("fetch")
+    >>> world = kv.worlds.KinematicWorld(model, "fetch")
+    >>> world.reset({"fetch/torso_lift_joint": 0.1})
+    >>> world.apply({"fetch/torso_lift_joint:velocity": 0.05}, 0.1)
+    >>> round(world.state["fetch/torso_lift_joint"], 3), round(world.time, 2)
+    (0.105, 0.1)
+    >>> world.contacts()
+    ()
     """
 
     name = "kinematic"
@@ -242,6 +258,10 @@ class KinematicWorld:
         """Start again from a state, at time 0, with nothing in the gripper and all speeds zero.
 
         Coordinates without a value have their default one.
+
+        See Also
+        --------
+        kineverse.worlds.KinematicWorld
         """
         self._check_version()
         values = self.model.default_state().updated(_select(state, self.model))

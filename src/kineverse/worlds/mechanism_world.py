@@ -37,6 +37,13 @@ class MechanismWorld:
         Model of the mechanism, whose constraints hold here.
     jammed
         Coordinates that do not move, by symbol or name.
+
+    Examples
+    --------
+    >>> world = kv.worlds.MechanismWorld(kv.load("lockboxes/thesis"))
+    >>> world.apply({"lockbox/a:velocity": 0.5, "lockbox/f:velocity": 0.5}, 0.5)  # a is locked
+    >>> round(world.state["lockbox/a"], 2), round(world.state["lockbox/f"], 2)
+    (0.0, 0.2)
     """
 
     name = "mechanism"

@@ -151,6 +151,15 @@ class MujocoWorld:
         If the model has no such robot, or no furniture has a coordinate of ``door_friction``.
     InvalidValueError
         For parameters out of their range.
+
+    Examples
+    --------
+    >>> model = kv.load("fetch")
+    >>> world = kv.worlds.MujocoWorld(model, "fetch")
+    >>> world.reset({"fetch/torso_lift_joint": 0.1})
+    >>> world.apply({"fetch/torso_lift_joint:velocity": 0.05}, 0.1)
+    >>> round(world.state["fetch/torso_lift_joint"], 1)
+    0.1
     """
 
     name = "mujoco"

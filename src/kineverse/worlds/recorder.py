@@ -108,6 +108,16 @@ class Recorder:
     FormatError
         If the file cannot be written, or the model is of a kind that a document cannot carry. Methods
         raise it too, such as on a full disk; what was written before can be read.
+
+    Examples
+    --------
+    >>> model = kv.load("shelf_door")
+    >>> with kv.worlds.Recorder("run.mcap", model) as recorder:
+    ...     for k in range(3):
+    ...         recorder.write_state(0.1 * k, {"shelf_door/door": 0.2 * k})
+    >>> run = kv.worlds.read_run_recording("run.mcap")
+    >>> run.model, len(run.states.times)
+    (<Snapshot: 4 frames, 1 DoF, 2 constraints (version 1)>, 3)
     """
 
     def __init__(

@@ -261,6 +261,10 @@ class RunRecording:
         Texts about the run.
     complete
         False if the file was cut, as after the process that wrote it was killed.
+
+    See Also
+    --------
+    kineverse.worlds.Recorder
     """
 
     path: Path
@@ -315,6 +319,10 @@ def read_run_recording(
         For a file that cannot be read, is damaged, or is no recording of a world.
     MissingDependencyError
         If the extra ``recording`` is not installed.
+
+    See Also
+    --------
+    kineverse.worlds.Recorder
     """
     path = Path(path)
     file = McapFile(path)

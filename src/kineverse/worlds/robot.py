@@ -36,6 +36,10 @@ class MobileBase:
         Its frames: that in which it moves, and that of the robot.
     is_planar
         Whether the coordinates are x [m], y [m] and a heading [rad], in this order.
+
+    See Also
+    --------
+    kineverse.worlds.Robot
     """
 
     coordinates: tuple[Symbol, ...]
@@ -61,6 +65,16 @@ class Robot:
         Its degrees of freedom, those of a mobile base included.
     speeds
         Its free speeds, in the order of the model.
+
+    Examples
+    --------
+    >>> model = kv.load("fetch")
+    >>> tags = model.include("kitchen")
+    >>> robot = kv.worlds.Robot.of(model, "fetch")
+    >>> robot.camera, robot.gripper().hand
+    ('fetch/head_tilt_link', 'fetch/gripper_link')
+    >>> robot.planar_base
+    (fetch/base/x, fetch/base/y, fetch/base/angle)
     """
 
     def __init__(
@@ -91,6 +105,10 @@ class Robot:
             For a robot that is neither a name nor a robot.
         UnknownNameError
             If nothing of the model that moves is below the prefix.
+
+        See Also
+        --------
+        kineverse.worlds.Robot
         """
         if isinstance(robot, Robot):
             if robot.is_mechanism:

@@ -30,6 +30,10 @@ class Observation:
         Frames of the robot that a touch sensor reports.
     seen
         Time of the poses where it is another one, as cameras are slower than encoders [s].
+
+    See Also
+    --------
+    kineverse.worlds.SensorSampler
     """
 
     stamp: float
@@ -59,6 +63,10 @@ class RobotInterface(Protocol):
         What users should know of it, such as what a simulation has added to the model or left out of it.
     timeout
         Time after which a command no longer acts [s].
+
+    See Also
+    --------
+    kineverse.worlds.KinematicWorld
     """
 
     name: str
@@ -101,7 +109,12 @@ class RobotInterface(Protocol):
 
 
 class PlannedContact(NamedTuple):
-    """Contact that a skill plans: the depth of these bodies is no overlap."""
+    """Contact that a skill plans: the depth of these bodies is no overlap.
+
+    See Also
+    --------
+    kineverse.manipulation.push
+    """
 
     pusher: tuple[str, ...]  # bodies of the robot
     pushed: tuple[str, ...]  # bodies of the object

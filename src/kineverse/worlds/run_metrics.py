@@ -52,7 +52,12 @@ _TOUCHING = 1e-6  # depth up to which links of a robot touch and do not overlap 
 
 
 class RunOverlap(NamedTuple):
-    """Overlap that came in a run."""
+    """Overlap that came in a run.
+
+    See Also
+    --------
+    kineverse.manipulation.open_object
+    """
 
     a: str  # names of the bodies
     b: str
@@ -106,6 +111,10 @@ class RunMetrics:
         If the handle is no body with shapes, or the model has no such part.
     InvalidValueError
         For a point that is none, or a number of steps below 1.
+
+    See Also
+    --------
+    kineverse.manipulation.open_object
     """
 
     def __init__(

@@ -130,6 +130,16 @@ class SensorSampler:
         If the model has no such robot, or no frame that the settings name.
     InvalidValueError
         If a field of view or a line of sight is asked for, but the robot has no camera.
+
+    Examples
+    --------
+    >>> model = kv.load("fetch")
+    >>> tags = model.include("kitchen")
+    >>> sensors = kv.worlds.Sensors.parse("3mm,0.5deg,30Hz")
+    >>> sampler = kv.worlds.SensorSampler(sensors, model, "fetch", seed=1)
+    >>> readings = sampler.observe(0.0, model.default_state())
+    >>> len(readings.poses) > 10
+    True
     """
 
     def __init__(self, sensors: Sensors, model: ModelView, robot: Robot | str, seed: int = 0) -> None:

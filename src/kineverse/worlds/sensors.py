@@ -77,6 +77,12 @@ class Sensors:
     ------
     InvalidValueError
         For negative and non-finite numbers, probabilities above 1, a rate of 0, an angle above 2 pi.
+
+    Examples
+    --------
+    >>> sensors = kv.worlds.Sensors(position=0.003, orientation=np.radians(0.5), rate=30)
+    >>> sensors.position_noise(np.array([0.5, 2.0]))
+    array([0.003, 0.003])
     """
 
     position: float = 0.0
@@ -177,6 +183,11 @@ class Sensors:
             For an unknown name, with the known ones.
         DuplicateNameError
             If something is stated twice.
+
+        Examples
+        --------
+        >>> kv.worlds.Sensors.parse("3mm+3mm/m,0.5deg,30Hz,drop=0.1").drop
+        0.1
         """
         if not isinstance(text, str):
             raise InvalidValueError(f"Sensors are stated by a text such as {EXAMPLE!r}, not by {text!r}.")

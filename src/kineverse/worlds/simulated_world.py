@@ -39,6 +39,10 @@ class Contact:
         Gap [m], negative for penetration.
     force
         Size of the force [N]; NaN in a world without forces.
+
+    See Also
+    --------
+    kineverse.worlds.KinematicWorld
     """
 
     a: str
@@ -50,7 +54,12 @@ class Contact:
 
 
 class SimulatedWorld(RobotInterface, Protocol):
-    """A simulated robot and its furniture, of which the truth is known: for trials, metrics and pictures."""
+    """A simulated robot and its furniture, of which the truth is known: for trials, metrics and pictures.
+
+    See Also
+    --------
+    kineverse.worlds.KinematicWorld
+    """
 
     @property
     def state(self) -> State:
@@ -72,7 +81,12 @@ class SimulatedWorld(RobotInterface, Protocol):
 
 
 class ChangeableWorld(SimulatedWorld, Protocol):
-    """Simulated world that people change while it runs: time goes on, and the robot stays where it is."""
+    """Simulated world that people change while it runs: time goes on, and the robot stays where it is.
+
+    See Also
+    --------
+    kineverse.worlds.KinematicWorld
+    """
 
     @property
     def sensors(self) -> Sensors:
@@ -210,6 +224,14 @@ class ForceLimit:
     ------
     InvalidValueError
         For a limit or a time that is not positive.
+
+    Examples
+    --------
+    >>> limit = kv.worlds.ForceLimit(50.0, time=0.05)
+    >>> limit.watch(80.0, 0.02), limit.watch(80.0, 0.04)
+    (False, True)
+    >>> limit.peak
+    80.0
     """
 
     def __init__(self, limit: float, time: float = 0.05) -> None:
@@ -236,6 +258,14 @@ class TrueBelief:
     ----------
     world
         World whose state is believed.
+
+    Examples
+    --------
+    >>> world = kv.worlds.KinematicWorld(kv.load("fetch"), "fetch")
+    >>> world.reset({"fetch/torso_lift_joint": 0.2})
+    >>> session = kv.manipulation.Session(world, belief=kv.worlds.TrueBelief(world))
+    >>> session.state["fetch/torso_lift_joint"]
+    0.2
     """
 
     def __init__(self, world: SimulatedWorld) -> None:

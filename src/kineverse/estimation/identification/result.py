@@ -212,7 +212,7 @@ class Fit(TableDisplay):
 def _format_numbers(value: Array | float) -> str:
     if np.ndim(value) < 2:
         return ", ".join(f"{number:.5g}" for number in np.ravel(value))
-    return "; ".join(_format_numbers(row) for row in np.asarray(value))
+    return f"array of {' × '.join(map(str, np.shape(value)))}"
 
 
 class LazyFit(NamedTuple):

@@ -475,6 +475,16 @@ class Tracker:
             observations if None.
         at, commands, inputs, process_noise
             As in :meth:`update`.
+
+        Examples
+        --------
+        >>> model = kv.load("kitchen")
+        >>> tracker = kv.estimation.Tracker(model, ["kitchen/fridge_door", "kitchen/oven_door"])
+        >>> state = model.default_state() | {"kitchen/fridge_door": 0.5}
+        >>> poses = [model.fk(frame)(state) for frame in tracker.observed]
+        >>> estimate = tracker.update_poses(np.stack(poses), mask=[True, False])
+        >>> round(estimate.state["kitchen/fridge_door"], 2)
+        0.5
         """
         reading = self._update_step.reader.read_poses(poses, mask, covariances)
         return self._update(self._make_step(at, reading, commands, inputs, process_noise))

@@ -213,7 +213,7 @@ class DecompositionOutcome:
 
     See Also
     --------
-    kineverse.geometry.decomposition.decompose_all
+    kineverse.geometry.decomposition.decompose
     """
 
     mesh: Mesh

@@ -67,6 +67,10 @@ class BasePlacement:
         Duration of the search [s].
     stands
         Whether the robot's base stands where it is, so that each sample is an arm instead of a base.
+
+    See Also
+    --------
+    kineverse.manipulation.PlacementSearch
     """
 
     grasp: Grasp | None
@@ -282,6 +286,19 @@ class PlacementSearch:
         Coordinates that move along paths, and those of a base that only stands somewhere.
     scene
         Scene of the checks, with the rules for pairs that overlap always.
+
+    Examples
+    --------
+    >>> model = kv.load("hsr")
+    >>> tags = model.include("kitchen")
+    >>> gripper = kv.grasping.find_gripper(model, "hsr")
+    >>> handle = kv.grasping.find_handle(model, "kitchen/fridge_door")
+    >>> state = model.default_state()
+    >>> search = kv.manipulation.PlacementSearch(model, "hsr", gripper, state)
+    >>> grasps = kv.grasping.sample_grasps(model, gripper, handle, count=16)
+    >>> placement = search.find(state, grasps, 0.3)
+    >>> bool(placement), placement.values[-1].round(2)
+    (True, np.float64(0.3))
     """
 
     def __init__(

@@ -105,6 +105,21 @@ def open_object(
     UnknownNameError, InvalidValueError
         Without a gripper or a handle, for a coordinate of the robot, a target out of limits, or less than one
         placement.
+
+    Examples
+    --------
+    >>> scene = kv.load("shelf_door")
+    >>> robot = kv.manipulation.place_robot(scene, "hsr", at=(-1.0, 0.0, 0.0))
+    >>> world = kv.worlds.KinematicWorld(scene, robot.name)
+    >>> world.reset(robot.start_state(scene))
+    >>> metrics = kv.worlds.RunMetrics(world, scene.symbol("shelf_door/door"))
+    >>> belief = kv.worlds.TrueBelief(world)
+    >>> session = kv.manipulation.Session(world, belief=belief, on_step=metrics)
+    >>> outcome = kv.manipulation.open_object(session, "shelf_door/door", target=0.3)
+    >>> outcome.done, round(world.state["shelf_door/door"], 1)
+    (True, 0.3)
+    >>> kv.manipulation.judge_outcome(outcome, metrics).claimed
+    True
     """
     coordinate = find_object_coordinate(session.robot, what)
     seconds, (target, tolerance) = as_positive(seconds, "seconds="), check_target(target, tolerance)

@@ -109,6 +109,10 @@ class Pushing:
     ------
     UnknownNameError, InvalidValueError
         For unknown names, a coordinate that moves no body, and a target beyond its limits.
+
+    See Also
+    --------
+    kineverse.manipulation.push
     """
 
     def __init__(

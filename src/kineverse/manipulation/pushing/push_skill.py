@@ -142,6 +142,17 @@ def push(
     ------
     UnknownNameError, InvalidValueError
         For a coordinate of the robot, and as :class:`.Pushing`.
+
+    Examples
+    --------
+    >>> scene = kv.load("shelf_door")
+    >>> robot = kv.manipulation.place_robot(scene, "hsr", at=(-1.0, -0.2, 0.0))
+    >>> world = kv.worlds.KinematicWorld(scene, robot.name)
+    >>> world.reset(robot.start_state(scene) | {"shelf_door/door": 0.4})
+    >>> session = kv.manipulation.Session(world, belief=kv.worlds.TrueBelief(world))
+    >>> outcome = kv.manipulation.push(session, "shelf_door/door", target=0.3, seconds=30)
+    >>> outcome.done, round(world.state["shelf_door/door"], 2)
+    (True, 0.3)
     """
     coordinate, seconds = find_object_coordinate(session.robot, what), as_positive(seconds, "seconds=")
     wanted, tolerance = check_target(target, tolerance)

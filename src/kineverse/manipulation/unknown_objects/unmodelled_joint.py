@@ -117,6 +117,14 @@ def forget_joint(model: Model, frame: str, state: State) -> Model:
         For a frame that no joint with coordinates places directly.
     EditError
         If something else in the model needs the joint.
+
+    Examples
+    --------
+    >>> model = kv.load("shelf_door")
+    >>> forget = kv.manipulation.unknown_objects.forget_joint
+    >>> unknown = forget(model, "shelf_door/door", model.default_state())
+    >>> unknown.degrees_of_freedom
+    ()
     """
     joint = find_joint(model, frame)
     if joint is None:

@@ -39,6 +39,10 @@ class LockTry:
         The coordinate, and where it was to go [m] or [rad].
     moved
         Whether it arrived.
+
+    See Also
+    --------
+    kineverse.manipulation.explore_locks
     """
 
     coordinate: Symbol
@@ -67,6 +71,10 @@ class LearnedLock:
         Further conditions, which held whenever the part moved.
     is_conjunction
         False if no conjunction agrees with the tries; then nothing is certain.
+
+    See Also
+    --------
+    kineverse.manipulation.explore_locks
     """
 
     coordinate: Symbol
@@ -108,6 +116,10 @@ class LockExploration:
         The last plan, by the model as it was learned.
     state
         Positions at the end.
+
+    See Also
+    --------
+    kineverse.manipulation.explore_locks
     """
 
     done: bool
@@ -156,6 +168,25 @@ def explore_locks(
     ------
     UnknownNameError, InvalidValueError
         As :func:`kineverse.reasoning.plan_unlocking`; also for coordinates without limits.
+
+    Examples
+    --------
+    >>> lid, bolt = kv.position("lid"), kv.position("bolt")
+    >>> unknown = kv.Model()
+    >>> with unknown.edit() as edit:
+    ...     edit.apply(kv.Prismatic(name="lid", parent="world", child="lid", lower=0, upper=1))
+    ...     edit.apply(kv.Prismatic(name="bolt", parent="world", child="bolt", lower=0, upper=1))
+    'joint lid'
+    'joint bolt'
+    >>> truth = unknown.copy()
+    >>> with truth.edit() as edit:
+    ...     edit.constrain("lock", *kv.articulations.speed_lock(lid, open_if=bolt > 0.5))
+    'constraint lock'
+    >>> session = kv.manipulation.Session(kv.worlds.MechanismWorld(truth), dt=0.05)
+    >>> mover = kv.manipulation.PartMover(unknown.snapshot(), session)
+    >>> explored = kv.manipulation.explore_locks(unknown, {"lid": 0.8}, mover.move)
+    >>> explored.done, [one.coordinate for one in explored.tries]
+    (True, [lid, bolt, lid])
     """
     goals = {model.degree_of_freedom(name): float(value) for name, value in goal.items()}
     return _Explorer(model, state, move, as_count("seed", seed, 0)).run(goals, as_count("most", most, 1))

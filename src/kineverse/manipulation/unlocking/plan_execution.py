@@ -44,6 +44,14 @@ class PartMover:
     ------
     InvalidValueError
         For a patience or a speed that is not positive.
+
+    Examples
+    --------
+    >>> box = kv.load("lockboxes/thesis")
+    >>> session = kv.manipulation.Session(kv.worlds.MechanismWorld(box), dt=0.05)
+    >>> mover = kv.manipulation.PartMover(box, session)
+    >>> round(mover.move("lockbox/f", 0.5), 2)
+    0.5
     """
 
     def __init__(
@@ -111,6 +119,10 @@ class ExecutedMove:
         Time that it took [s].
     done
         Whether it ended at the target.
+
+    See Also
+    --------
+    kineverse.manipulation.execute_unlocking
     """
 
     step: UnlockingStep
@@ -158,6 +170,10 @@ class UnlockingExecution:
         Time that it took [s].
     state
         Believed state at the end.
+
+    See Also
+    --------
+    kineverse.manipulation.execute_unlocking
     """
 
     done: bool
@@ -228,6 +244,14 @@ def execute_unlocking(
     ------
     UnknownNameError, InvalidValueError
         As :func:`kineverse.reasoning.plan_unlocking`; also for times and speeds that are not positive.
+
+    Examples
+    --------
+    >>> model = kv.load("articulations/garage_door")
+    >>> session = kv.manipulation.Session(kv.worlds.MechanismWorld(model), dt=0.05)
+    >>> result = kv.manipulation.execute_unlocking(session, {"garage_door/garage/door": 1.0})
+    >>> result.done, len(result.moves)
+    (True, 2)
     """
     mover = PartMover(model or session.model, session, patience=patience, speed=speed)
     return _Execution(mover, goal, fixed, budget).run()

@@ -38,6 +38,10 @@ class SphereCover:
         (N, 3) and (N,) in the frame of the solids' poses [m]; read-only.
     protrusion
         Upper bound of the distance of any point of a sphere from the solids [m].
+
+    See Also
+    --------
+    kineverse.planning.spheres.cover_solids
     """
 
     centres: Floats
@@ -55,7 +59,12 @@ class SphereCover:
 
 
 def cover_solid(solid: Solid, protrusion: float | None = None, most: int = MOST) -> SphereCover:
-    """Return few spheres that cover a convex solid, in its frame; see :func:`cover_solids`."""
+    """Return few spheres that cover a convex solid, in its frame; see :func:`cover_solids`.
+
+    See Also
+    --------
+    kineverse.planning.spheres.cover_solids
+    """
     return cover_solids([(solid, np.eye(4))], protrusion, most)
 
 
@@ -82,6 +91,14 @@ def cover_solids(
     InvalidValueError
         For a triangle mesh, which has no inside; or if there is no solid, the protrusion is not a positive
         length, or ``most`` not between 1 and 1024.
+
+    Examples
+    --------
+    >>> from kineverse.geometry.shapes import solid_from_geometry
+    >>> solid = solid_from_geometry(kv.model.Box((0.4, 0.3, 0.2)))
+    >>> cover = kv.planning.spheres.cover_solids([(solid, np.eye(4))], protrusion=0.05)
+    >>> cover.protrusion < 0.06, len(cover.radii) < 48
+    (True, True)
     """
     check_cover_settings(protrusion, most)
     if not solids:
@@ -119,6 +136,10 @@ def default_protrusion(solids: Sequence[tuple[Solid, Floats]]) -> float:
     """Return the default protrusion of covers: a tenth of the size, from 5 mm to 25 mm [m].
 
     The size is the edge of a cube with the volume of the union.
+
+    See Also
+    --------
+    kineverse.planning.spheres.cover_solids
     """
     if len(solids) == 1:
         volume = solid_volume(solids[0][0])

@@ -34,6 +34,10 @@ class SphereTree:
         (M + 1,) children of coarse sphere k are ``first[k]`` to ``first[k + 1] - 1``.
     ball_centre, ball_radius
         (3,) and radius of the ball that contains all [m].
+
+    See Also
+    --------
+    kineverse.planning.spheres.make_sphere_tree
     """
 
     centres: Floats
@@ -58,6 +62,13 @@ def make_sphere_tree(centres: npt.ArrayLike, radii: npt.ArrayLike) -> SphereTree
         If the arrays have other shapes, or there is no sphere.
     InvalidValueError
         If a centre is not finite, or a radius not positive.
+
+    Examples
+    --------
+    >>> centres = np.random.default_rng(0).uniform(size=(50, 3))
+    >>> tree = kv.planning.spheres.make_sphere_tree(centres, np.full(50, 0.1))
+    >>> len(tree.coarse_radii) < 50
+    True
     """
     where, sizes = np.array(centres, dtype=float), np.array(radii, dtype=float)
     if where.ndim != 2 or where.shape[1] != 3 or sizes.shape != where.shape[:1] or not len(sizes):
@@ -83,6 +94,12 @@ def enclosing_ball(centres: Floats, radii: Floats) -> tuple[Floats, float]:
 
     The centre approaches the sphere that reaches furthest by ever smaller steps (Bădoiu and Clarkson, Smaller
     core-sets for balls, 2003); the best centre on the way is taken.
+
+    Examples
+    --------
+    >>> centre, radius = kv.planning.spheres.enclosing_ball(np.eye(3), np.full(3, 0.1))
+    >>> round(radius, 2)
+    0.92
     """
     if len(radii) == 1:
         return centres[0].copy(), float(radii[0])

@@ -50,6 +50,10 @@ class BlendedPath:
         Lengths of the segments (N-1,).
     reach
         Distances l from the inner corners at which their blends begin and end (N-2,); 0 for none.
+
+    See Also
+    --------
+    kineverse.planning.round_corners
     """
 
     points: Array
@@ -110,6 +114,12 @@ def round_corners(
     ShapeError, InvalidValueError
         For points that are not an (N, n) array of finite numbers, N >= 1, or a deviation that is not a number
         from 0 or of another shape.
+
+    Examples
+    --------
+    >>> path = kv.planning.round_corners([[0, 0], [1, 0], [1, 1]], deviation=0.1)
+    >>> path.deviation
+    array([0.1])
     """
     polyline = np.array(points, dtype=float)
     if polyline.ndim != 2 or not polyline.size:

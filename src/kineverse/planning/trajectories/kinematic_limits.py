@@ -23,7 +23,12 @@ UNSTATED_SPEED = 1.0  # speed [rad/s], [m/s] of coordinates for which the model 
 
 
 class MotionLimits(NamedTuple):
-    """Largest speeds and accelerations of coordinates, (n,) each [rad/s], [m/s] and per second."""
+    """Largest speeds and accelerations of coordinates, (n,) each [rad/s], [m/s] and per second.
+
+    See Also
+    --------
+    kineverse.planning.motion_limits
+    """
 
     velocity: Array
     acceleration: Array
@@ -59,6 +64,12 @@ def motion_limits(
     ------
     InvalidValueError
         For a ramp or speed that is not positive.
+
+    Examples
+    --------
+    >>> model = kv.load("kitchen")
+    >>> kv.planning.motion_limits(model, [model.symbol("kitchen/fridge_door")])
+    MotionLimits(velocity=array([1.5]), acceleration=array([3.]))
     """
     for name, number in (("ramp", ramp), ("speed", speed)):
         checked = finite_number(number)

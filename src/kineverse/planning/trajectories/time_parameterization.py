@@ -252,6 +252,14 @@ def time_parameterize(
     InvalidValueError
         For a limit that is not positive, or an acceleration that is not finite, of a coordinate that moves;
         as :func:`.round_corners`.
+
+    Examples
+    --------
+    >>> x, y = kv.position("x"), kv.position("y")
+    >>> corner = [[0, 0], [1, 0], [1, 1]]
+    >>> motion = kv.planning.time_parameterize(corner, 1.0, 2.0, symbols=[x, y], deviation=0.1)
+    >>> round(motion.duration, 1), motion.positions[-1]
+    (2.5, array([1., 1.]))
     """
     path = points if isinstance(points, BlendedPath) else round_corners(points, deviation, valid)
     n = path.points.shape[1]

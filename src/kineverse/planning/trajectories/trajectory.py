@@ -66,6 +66,13 @@ class Trajectory:
     InvalidValueError
         For times that do not begin at 0 or do not increase, numbers that are not finite, a symbol that is
         there twice, or one that is no coordinate.
+
+    Examples
+    --------
+    >>> q = kv.position("door")
+    >>> motion = kv.planning.time_parameterize([[0.0], [1.0]], 1.0, 2.0, symbols=[q])
+    >>> motion.duration, motion.at(0.75)
+    (1.5, State({door: 0.5}, stamp=0.75))
     """
 
     symbols: tuple[Symbol, ...]
@@ -349,6 +356,18 @@ class TrajectoryFollower:
     ----------
     tasks
         One goal for each coordinate.
+
+    Examples
+    --------
+    >>> model = kv.load("kitchen")
+    >>> door = model.symbol("kitchen/fridge_door")
+    >>> motion = kv.planning.time_parameterize([[0.0], [1.0]], 1.0, 2.0, symbols=[door])
+    >>> follower = kv.planning.TrajectoryFollower(motion)
+    >>> controller = kv.control.Controller(model, follower.tasks, dt=0.02, tier="interpreter")
+    >>> follower.set(controller, 0.75)
+    >>> command = controller.step(motion.at(0.75))
+    >>> round(command.speeds[door.derivative()], 2)
+    1.0
     """
 
     def __init__(
