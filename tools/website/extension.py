@@ -10,7 +10,7 @@ from typing import Any
 from docutils import nodes
 from jinja2.bccache import Bucket, BytecodeCache
 from jinja2.sandbox import SandboxedEnvironment
-from numpydoc import docscrape_sphinx
+from numpydoc import docscrape_sphinx, xref
 from sphinx.addnodes import pending_xref
 from sphinx.application import Sphinx
 from sphinx.environment import BuildEnvironment
@@ -25,6 +25,7 @@ def setup(app: Sphinx) -> dict[str, Any]:
     app.add_html_math_renderer("mathml", (_visit_math, None), (_visit_display, None))
     app.connect("missing-reference", _find_reference)
     app.connect("autodoc-process-signature", _write_signature, priority=100)  # before numpydoc
+    xref.DEFAULT_LINKS.clear()  # they lead into documentation elsewhere
     docscrape_sphinx.SandboxedEnvironment = partial(SandboxedEnvironment, bytecode_cache=_CompiledTemplates())
     app.connect("html-page-context", _share_sidebar, priority=100)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

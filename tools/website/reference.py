@@ -101,12 +101,17 @@ def _document(one: PublicName) -> str:
     elif inspect.isfunction(value):
         text = f".. autofunction:: {one.home}"
     else:
-        text = f".. py:data:: {one.home}\n   :value: {_write_value(one)}\n\n   {_describe_value(one)}"
+        text = _document_value(one)
     users = find_users().get(one.home)
     if not users:
         return text
     links = ", ".join(f":doc:`/{find_documents()[file]}`" for file in users)
     return f"{text}\n\n.. rubric:: Used in\n\n{links}"
+
+
+def _document_value(one: PublicName) -> str:
+    options = f"   :module: {one.module}\n   :value: {_write_value(one)}"
+    return f".. py:data:: {one.name}\n{options}\n\n   {_describe_value(one)}"
 
 
 def _write_value(one: PublicName) -> str:
