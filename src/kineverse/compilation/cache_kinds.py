@@ -9,7 +9,6 @@ from __future__ import annotations
 import logging
 import os
 import shutil
-import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
@@ -76,15 +75,9 @@ def measure_kind(name: str) -> CacheUsage:
     """Return what the cache has of a kind; nothing is made or removed."""
     kind, folder = KINDS[name], library_cache().folder / KINDS[name].folder
     found = [status for _, status in _files(kind, folder)]
-    times = [status.st_mtime for status in found] or [None]
-    return CacheUsage(
-        kind,
-        folder,
-        len(found),
-        sum(status.st_size for status in found),
-        min(times, key=_age),
-        max(times, key=_age),
-    )
+    times = [status.st_mtime for status in found]
+    size = sum(status.st_size for status in found)
+    return CacheUsage(kind, folder, len(found), size, min(times, default=None), max(times, default=None))
 
 
 def clear_kind(name: str) -> CacheUsage:
@@ -137,7 +130,3 @@ def _open(folder: Path) -> PrivateFolder:
         return PrivateFolder(folder)
     except NotPrivateError as error:
         raise PermissionError(None, f"{error}", str(folder)) from None
-
-
-def _age(moment: float | None) -> float:
-    return time.time() if moment is None else moment
