@@ -8,7 +8,7 @@ BIN := $(VENV)/bin
 INSTALL := $(BIN)/python -m pip install --quiet --no-input --disable-pip-version-check --no-deps
 
 # One file is unpacked by one core, the largest first.
-INSTALL_FILES = printf '%s\n' $(filter %.txt,$^) | xargs -P $(JOBS) -I {} $(INSTALL) -r {}
+INSTALL_FILES = printf '%s\n' $(filter %.txt,$^) | xargs -P $(JOBS) -I {} $(INSTALL) --require-hashes -r {}
 
 # What the demo and every command in the README need.
 DEMO := $(patsubst %,requirements/%.txt,geometry core view figures build control recording exchange)
@@ -18,16 +18,18 @@ TEST := $(patsubst %,requirements/%.txt,peers test learning usd check notebooks)
 WHEELS := $(shell $(PYTHON) -c 'import platform as p; print(p.system(), p.machine(), *p.python_version_tuple()[:2])')
 ROS := $(if $(and $(filter Linux-x86_64-3-11,$(subst $() ,-,$(WHEELS))),$(shell command -v cmake),$(shell command -v c++)),$(VENV)/ros.installed)
 
-.PHONY: help demo test ros sanitize fuzz faults format clean
+.PHONY: help demo test docs ros sanitize fuzz faults release format clean
 .NOTPARALLEL:
 
 help:
 	@echo "make demo    a robot opens and closes a kitchen, live in the browser (ARGS=--headless: a table, a picture, and end)"
 	@echo "make test    formatter, linter, types, layers, tests"
+	@echo "make docs    the documentation as pages that need no network: build/site/index.html"
 	@echo "make ros     an environment with ROS 2, .venv/ros, for kineverse ros without an installation of it"
 	@echo "make sanitize  all C with sanitizers, and the tests that use it (ARGS=--short: a little of each)"
 	@echo "make fuzz    look for inputs that break a reader (ARGS='--target sdf --minutes 60')"
 	@echo "make faults  damage files of model servers, cut networks, kill and freeze processes (ARGS=live: of a moving robot)"
+	@echo "make release  build the distributions, check them, and try them in clean environments (ARGS='--only core')"
 	@echo "make format  format the code and mend what the linter can mend"
 	@echo "make clean   remove the environment and what the tools left"
 
@@ -46,6 +48,9 @@ test: $(VENV)/test.installed $(ROS)
 	$(BIN)/python -m pytest -q -n $(JOBS) --dist loadfile --no-loadscope-reorder --assert=plain $(ARGS) || \
 	    { $(BIN)/python -m pytest -q --last-failed --last-failed-no-failures=none $(ARGS); exit 1; }
 
+docs: $(VENV)/docs.installed
+	$(BIN)/python tools/website --jobs $(JOBS) $(ARGS)
+
 ros: $(VENV)/ros.installed
 
 sanitize: $(VENV)/test.installed
@@ -56,6 +61,9 @@ fuzz: $(VENV)/fuzz.installed
 
 faults: $(VENV)/test.installed
 	PYTHONPATH=tools $(BIN)/python -m faults $(ARGS)
+
+release: $(VENV)/release.installed
+	$(VENV)/release/bin/python tools/release $(ARGS)
 
 format: $(VENV)/test.installed
 	$(BIN)/ruff format .
@@ -86,8 +94,20 @@ $(VENV)/ros.installed: requirements/ros.txt tools/ros_environment.py $(VENV)/dem
 	@echo "Installing ROS 2 into $(VENV)/ros; this takes a minute, once."
 	@$(BIN)/python -m venv --without-pip --clear $(VENV)/ros
 	@$(BIN)/python -m pip --python $(VENV)/ros/bin/python install --quiet --no-input --disable-pip-version-check \
-	    --no-deps -r requirements/ros.txt
+	    --no-deps --require-hashes -r requirements/ros.txt
 	@$(VENV)/ros/bin/python tools/ros_environment.py $(BIN)/python
+	@touch $@
+
+# It has other versions of what .venv has.
+$(VENV)/release.installed: requirements/release.txt | $(BIN)/python
+	@$(BIN)/python -m venv --clear $(VENV)/release
+	@$(BIN)/python -m pip --python $(VENV)/release/bin/python install --quiet --no-input --disable-pip-version-check \
+	    --no-deps --require-hashes -r requirements/release.txt
+	@touch $@
+
+# Sphinx imports what it documents, the parts for other libraries as well.
+$(VENV)/docs.installed: requirements/docs.txt $(VENV)/test.installed
+	@$(INSTALL_FILES)
 	@touch $@
 
 $(VENV)/fuzz.installed: requirements/fuzz.txt $(VENV)/test.installed

@@ -1,17 +1,19 @@
-"""The examples in Markdown files: taken out, run, and held against the output that is printed below them."""
+"""The examples in Markdown files: taken out, run, and held against the output that is printed below them.
+
+It needs nothing but Python, as a release is tried by it where there is no pytest.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import doctest
 import io
+import math
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import zip_longest
 from pathlib import Path
-
-import pytest
 
 ROOT = Path(__file__).parents[1]
 
@@ -57,7 +59,7 @@ def run(file: Path) -> None:
             exec(code, names)
         if example.output is not None and not agree(example.output, printed.getvalue()):
             where = f"{example.file.relative_to(ROOT)}, line {example.line}"
-            pytest.fail(f"{where} says\n{example.output}\nbut it prints\n{printed.getvalue()}", pytrace=False)
+            raise AssertionError(f"{where} says\n{example.output}\nbut it prints\n{printed.getvalue()}")
 
 
 def agree(wanted: str, got: str, rel: float = 1e-6) -> bool:
@@ -67,7 +69,7 @@ def agree(wanted: str, got: str, rel: float = 1e-6) -> bool:
     if _words(wanted) != _words(got):
         return False
     pairs = zip(_NUMBER.findall(wanted), _NUMBER.findall(got), strict=True)
-    return all(float(a) == pytest.approx(float(b), rel=rel, abs=1e-3 * rel) for a, b in pairs)
+    return all(math.isclose(float(a), float(b), rel_tol=rel, abs_tol=1e-3 * rel) for a, b in pairs)
 
 
 def _words(text: str) -> str:

@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 
 import kineverse as kv
+from kineverse import errors
 from kineverse.cli import main
 from markdown_examples import ROOT
 
@@ -231,3 +232,12 @@ def test_docs_warn_of_comparing_an_expression_with_a_number():
 
 def test_the_table_of_mistakes_is_long_enough():
     assert len(PYTHON) + len(COMMANDS) >= 25
+
+
+def test_the_page_of_errors_has_each_class_with_the_built_in_error_that_it_is() -> None:
+    page = (ROOT / "docs" / "errors.md").read_text(encoding="utf-8")
+    rows = dict(re.findall(r"^\| `(\w+)` \| `(\w+)` \|", page, re.MULTILINE))
+    classes = {name: getattr(errors, name) for name in errors.__all__ if name.endswith("Error")}
+    assert set(rows) == set(classes) - {"KineverseError"}
+    for name, base in rows.items():
+        assert base in {one.__name__ for one in classes[name].__mro__[1:]}, name

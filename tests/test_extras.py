@@ -15,9 +15,12 @@ import pytest
 from kineverse import _extras
 from kineverse._extras import DISTRIBUTION, install_command, install_distribution, requirements
 from kineverse._version import __version__
+from kineverse.cli.arguments import MODULES
+from test_examples import NEEDED, SCRIPTS
 
 ROOT = Path(__file__).parents[1]
-EXTRAS = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]["optional-dependencies"]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
+EXTRAS = PROJECT["optional-dependencies"]
 STUDIES = tomllib.loads((ROOT / "studies" / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 HERE = Path(sys.executable)
 
@@ -130,3 +133,70 @@ def test_every_missing_extra_names_the_same_install_command():
         assert "pip install '." not in text.replace("pip install -e '.", ""), page
         for extra in re.findall(r"/studies\[(\w+)\]", text):
             assert extra in STUDIES["optional-dependencies"], page
+
+
+def test_each_example_names_the_extras_that_it_needs():
+    """Those that name none run with the core alone; a release tries this."""
+    modules = {module: extra for extra, module in MODULES.items()} | {"jax": "jax"}
+    listed = (ROOT / "examples" / "README.md").read_text("utf-8").splitlines()
+    for script in SCRIPTS:
+        (row,) = (line for line in listed if line.startswith(f"| [{script.name}]"))
+        assert {modules[name] for name in NEEDED.get(script.stem, ())} <= {*re.findall(r"`(\w+)`", row)}, row
+
+
+def test_the_installation_page_has_every_variable_that_is_read():
+    page = (ROOT / "docs" / "installation.md").read_text("utf-8")
+    sources = [*(ROOT / "src").rglob("*.py"), *(ROOT / "ros").rglob("*.py")]
+    read = {
+        name
+        for source in sources
+        for name in re.findall(r"\bKINEVERSE_[A-Z_]+\b", source.read_text("utf-8"))
+        if name != "KINEVERSE_FLOAT"  # a macro of C
+    }
+    assert "KINEVERSE_CACHE_DIR" in read
+    assert {name for name in read if f"| `{name}`" not in page} == set()
+
+
+CORE_COMMANDS = ("info", "fk", "convert", "diff", "validate", "unlock", "fit", "calibrate", "cache")
+TRIED = """\
+info kitchen
+fk kitchen kitchen/fridge_door_handle --set kitchen/fridge_door=30deg
+convert kitchen made.urdf
+convert made.urdf made.kv.json
+convert kitchen made.sdf
+convert kitchen made.xml
+validate made.urdf made.sdf
+diff examples/door.urdf examples/door.urdf
+unlock lockboxes/thesis --goal lockbox/a=1.2
+fit examples/poses.csv --parent cupboard --child door
+calibrate examples/door.urdf --help
+cache
+"""
+
+
+def test_what_the_installation_page_promises_of_the_core_is_true(tmp_path):
+    """With all other packages hidden, in another process; a release tries it where they are not installed."""
+    page = (ROOT / "docs" / "installation.md").read_text("utf-8")
+    promised = page.partition("The core alone has")[2].partition("\n\n")[0]
+    assert {*CORE_COMMANDS} <= {*re.findall(r"[`,\s](\w+)`", promised)}
+    assert {*CORE_COMMANDS} == {line.split()[0] for line in TRIED.splitlines()}
+    allowed = {re.split(r"[>=]", line)[0] for line in PROJECT["dependencies"]}
+    allowed |= {"kineverse", "markdown_it", "mdurl", "pygments"}
+    hidden = {name for name in metadata.packages_distributions() if name not in allowed}
+    (tmp_path / "examples").symlink_to(ROOT / "examples")
+    program = f"""
+import sys
+sys.modules.update(dict.fromkeys({sorted(hidden)!r}))
+sys.path.append({str(ROOT / "tests")!r})
+import shlex
+import markdown_examples
+from kineverse.cli import main
+for line in {TRIED.splitlines()!r}:
+    status = main(shlex.split(line))
+    assert status == 0, (line, status)
+markdown_examples.run(markdown_examples.ROOT / "docs" / "models.md")
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    assert (done.returncode, done.stderr) == (0, "")

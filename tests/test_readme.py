@@ -6,6 +6,7 @@ That the tour prints what is printed below it is tested with the other pages in 
 
 from __future__ import annotations
 
+import re
 import tomllib
 
 from kineverse._version import __version__
@@ -50,3 +51,22 @@ def test_the_release_notes_are_short_and_of_this_version() -> None:
     text = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
     assert len(text.splitlines()) <= 60
     assert f"## {__version__.rpartition('.')[0]}" in text
+
+
+def test_the_figures_beside_peers_are_those_of_the_benchmarks() -> None:
+    rows = re.findall(
+        r"^\| .* \| (.* [nµm]s) \| (.*\d ×.*) \|$", README.read_text(encoding="utf-8"), re.MULTILINE
+    )
+    assert rows
+    page = (ROOT / "docs" / "benchmarks.md").read_text(encoding="utf-8")
+    for time, others in rows:
+        ours = re.findall(rf"^\| (.*) \| {re.escape(time)} \|", page, re.MULTILINE)
+        assert ours, time
+        for factor in re.findall(r"([\d.]+) ×", others):
+            assert any(
+                re.search(
+                    rf"\| {re.escape(factor)} × {re.escape(name)}|; {re.escape(factor)} × {re.escape(name)}",
+                    page,
+                )
+                for name in ours
+            ), factor

@@ -85,6 +85,7 @@ values = home
 assert_type(home.updated({a: 0.25}), kv.State)
 assert_type(model.violations(home).__class__.__name__, str)
 assert_type(kv.velocity("a"), kv.Symbol)
+assert_type(kv.acceleration("a"), kv.Symbol)
 assert_type(a.derivative(), kv.Symbol)
 assert kv.symbols.symbol("a") == a
 assert_type(kv.rotation_y(a), kv.Expression)

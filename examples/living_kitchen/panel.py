@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from kineverse.view.html import BREAK, Html, HtmlBox, element, join_html
+from kineverse._rich_display import Html, element, join_html
+from kineverse.view.html import BREAK, HtmlBox
 
 from .identify import FamilyProbabilities
 from .report import tabulate_identification, tabulate_tracking

@@ -81,6 +81,7 @@ if TYPE_CHECKING:
     from kineverse.state import State as State, StateLike as StateLike
     from kineverse.symbols import (
         Symbol as Symbol,
+        acceleration as acceleration,
         parameter as parameter,
         position as position,
         velocity as velocity,

@@ -18,7 +18,7 @@ def lazy_face(package: str, below: Callable[[], Mapping[str, str]] | None = None
     """
     face = vars(sys.modules[package])
     homes = _list_imports(sys._getframe(1).f_code)
-    public = sorted(homes)
+    public = sorted(name for name in homes if not name.startswith("_"))
 
     def find(name: str) -> object:
         home = homes.get(name)

@@ -55,6 +55,7 @@ __all__ = [
 ]
 
 Array: TypeAlias = npt.NDArray[np.float64]
+"""An array of float64."""
 
 EXACT_TOLERANCE = 1e-15  # distance to 0, 1 or -1 below which an entry of a rotation is exactly that
 

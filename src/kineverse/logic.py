@@ -39,6 +39,7 @@ from kineverse.symbols import Symbol
 __all__ = ["CONTRAST", "less", "logic_and", "logic_not", "logic_or"]
 
 CONTRAST = 1e10
+"""Contrast of comparisons by default: they change from 0 to 1 within about 1e-10 around equality."""
 
 
 def less(a: ExpressionLike, b: ExpressionLike, contrast: float = CONTRAST) -> Expression:

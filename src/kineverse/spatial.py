@@ -66,6 +66,7 @@ __all__ = [
 ]
 
 Direction = tuple[float, float, float]
+"""A unit vector of numbers."""
 
 X, Y, Z = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
 
@@ -264,6 +265,7 @@ def _without_axis(transform: Expression) -> Expression:
 
 
 VectorLike: TypeAlias = ExpressionLike
+"""A vector of three elements, numbers or expressions."""
 
 
 def translation(

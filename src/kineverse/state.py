@@ -310,7 +310,7 @@ class State(Mapping[Symbol, float]):
         return f"State({{{shown}{more}}}{when})"
 
     def _repr_html_(self) -> str:
-        from kineverse.expressions.printing import html_table  # for start-up time
+        from kineverse._rich_display import html_table  # for start-up time
 
         about = [f"{len(self)} values"]
         about += [] if self.stamp is None else [f"at {self.stamp:g} s"]

@@ -23,6 +23,7 @@ __all__ = [
     "ROLES",
     "Role",
     "Symbol",
+    "acceleration",
     "parameter",
     "parse_symbol_name",
     "position",
@@ -32,18 +33,21 @@ __all__ = [
 ]
 
 Role: TypeAlias = Literal["dof", "parameter", "contact", "location"]
+"""Kind of variable that a symbol stands for."""
 
 ROLES: tuple[Role, ...] = get_args(Role)
+"""All roles of symbols."""
 _UNPRINTABLE = re.compile("[\x00-\x1f\ud800-\udfff]")
 _ORDER = re.compile("0|[1-9][0-9]{0,8}")
 ORDER_NAMES = ("position", "velocity", "acceleration", "jerk", "snap")
+"""Names of the orders of time derivatives, as they stand after the colon of a name."""
 
 _INTERNED: dict[tuple[str, int, str, float | None], Symbol] = {}
 _INTERNING = threading.Lock()
 
 
 class Symbol(Expression):
-    """A scalar symbol, see :func:`position`, :func:`velocity`, :func:`symbol` and :func:`parameter`.
+    """A scalar symbol, see :func:`position`, :func:`velocity`, :func:`acceleration` and :func:`parameter`.
 
     Attributes
     ----------
@@ -251,6 +255,11 @@ def velocity(path: str) -> Symbol:
     True
     """
     return Symbol(path, 1)
+
+
+def acceleration(path: str) -> Symbol:
+    """Return the acceleration symbol of a degree of freedom."""
+    return Symbol(path, 2)
 
 
 def parameter(path: str, value: float) -> Symbol:

@@ -110,6 +110,28 @@ def test_what_a_robot_outside_does_not_know_is_refused(run, outside, words, mess
     assert len([line for line in err.splitlines() if line.startswith("kineverse:")]) == 1
 
 
+def test_the_time_to_be_seen_begins_when_the_estimator_is_there(monkeypatch):
+    class Belief:
+        time, looks = 0.0, 0
+
+        @property
+        def seen(self):
+            return {"flap": self.time} if self.looks > 2 else {}
+
+        def update(self, observation, time):
+            self.looks += 1
+            self.time += 100.0 if self.looks == 1 else 0.1
+            return self.looks
+
+    belief = Belief()
+    clock = SimpleNamespace(monotonic=lambda: belief.time, sleep=lambda seconds: None)
+    monkeypatch.setattr(outside_robot, "time", clock)
+    robot = object.__new__(outside_robot.OutsideRobot)
+    robot.belief, robot._coordinate = belief, "flap"
+    robot.interface = SimpleNamespace(observe=lambda: None, time=0.0)
+    assert robot.look() > 2
+
+
 @pytest.mark.parametrize("why", ["blind", "nobody observes it", "offline", "not installed"])
 def test_what_keeps_a_robot_from_beginning_is_one_error(run, outside, why):
     class Blind(Outside):

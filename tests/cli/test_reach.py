@@ -125,8 +125,8 @@ def test_collisions_are_respected(run):
     ("words", "message"),
     [
         (["fetch", HAND, "--pose", "1", "2"], "6 with roll, pitch and yaw"),
-        (["fetch", HAND, "--pose", "1", "2", "x"], "'x' is not a value"),
-        (["fetch", HAND, "--pose", "1", "2", "-nan"], "'-nan' is not a value"),
+        (["fetch", HAND, "--pose", "1", "2", "x"], "'x' is not a length"),
+        (["fetch", HAND, "--pose", "1", "2", "-nan"], "'-nan' is not a length"),
         (["fetch", HAND, "--pose", "1", "2", "3", "--picture", "a.jpg"], "written as .png"),
         (["fetch", HAND, "--pose", "fetch/grippr_link"], "fetch/gripper_link"),
         (["fetch", "fetch/grippr_link", "--pose", "1", "2", "3"], "fetch/gripper_link"),
@@ -173,4 +173,4 @@ def test_patterns_keep_coordinates_still(run):
     assert status == 0
     assert not [name for name in json.loads(out)["positions"] if "base/" in name or "torso" in name]
     status, _, err = run(*words, "pr3/*")
-    assert (status, "--still pr3/*: no coordinate matches" in err) == (2, True)
+    assert (status, "--still: no coordinate matches 'pr3/*'" in err) == (2, True)

@@ -34,7 +34,7 @@ def shown(monkeypatch):
     pages = []
 
     def interrupted(page):
-        pages.append((page._panel.degrees, page.address))
+        pages.append((page._display.degrees, page.address))
         raise KeyboardInterrupt
 
     monkeypatch.setattr(viewer.Viewer, "wait", interrupted)

@@ -249,11 +249,13 @@ def test_the_package_of_certificates_can_be_missing(monkeypatch: pytest.MonkeyPa
 
 
 def test_addresses_for_clients_have_a_host_of_the_certificate(home: Path) -> None:
-    endpoints = ["tls/0.0.0.0:1", "tls/[::]:2", "tls/127.0.0.1:3", "unixsock-stream//x"]
+    """An address by which the server does not show its certificate would be refused by each client."""
+    endpoints = ["tls/0.0.0.0:1", "tls/[::]:2", "tls/127.0.0.1:3", "tls/home.lan:4", "unixsock-stream//x"]
     assert list_addresses(endpoints, "home", str(home / "server")) == [
         "live:tls/home.lan:1/home",
         "live:tls/home.lan:2/home",
-        "live:tls/127.0.0.1:3/home",
+        "live:tls/home.lan:3/home",
+        "live:tls/home.lan:4/home",
         "live:unixsock-stream//x/home",
     ]
     assert list_addresses(["tcp/0.0.0.0:1"], "home", None) == ["live:tcp/0.0.0.0:1/home"]

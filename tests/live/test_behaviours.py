@@ -218,5 +218,5 @@ def test_a_robot_that_is_away_is_waited_for_and_a_wrong_name_is_not():
     assert (closer.note.doing, closer.note.why) == ("waits", sessions.offline)
     sessions.offline = ""
     run_until(closer, is_watching(closer))
-    with pytest.raises(UnknownNameError, match="No door, drawer or other object is named 'room/lid'"):
+    with pytest.raises(UnknownNameError, match="There is no door, drawer or other object 'room/lid'"):
         Closer(sessions, patterns=["room/lid"]).step()

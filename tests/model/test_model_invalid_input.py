@@ -222,4 +222,4 @@ def test_a_missing_name_is_not_in_a_mapping_and_has_a_default() -> None:
     assert len(model.frames) == len(list(model.frames.values())) == 3
     assert model.frames == dict(model.frames.items())
     assert repr(model.frames) == "<3 frames: door, door/handle, base>"
-    assert str(model) == "3 frames, 4 DoF, 1 constraints (version 1)"
+    assert str(model) == "3 frames, 4 DoF, 1 constraint (version 1)"

@@ -183,7 +183,7 @@ def test_latched_messages_reach_a_late_node():
         ({"omit": ["cam/"]}, "There is nothing to publish"),
         ({"rate": 0.0}, "rate is a positive number"),
         ({"rate": "fast"}, "rate is a positive number"),
-        ({"robot": "pr2"}, "has 'pr2/', which names nothing"),
+        ({"robot": "pr2"}, "robot is 'pr2', and no joint of the model is below that name"),
         ({"robot": 7}, "robot is a text"),
         ({"sources": 7}, "sources is a list of texts"),
         ({"sources": ["a", "/a"]}, "a topic is there twice"),

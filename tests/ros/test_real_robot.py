@@ -57,7 +57,9 @@ def test_a_skill_moves_an_object_through_topics_alone(ros_python, tmp_path, monk
         cwd=tmp_path, stdout=subprocess.PIPE, text=True,
     )  # fmt: skip
     try:
-        assert simulated.stdout.readline().startswith("robot: arm in the kinematic world")
+        said = [simulated.stdout.readline().strip() for _ in range(4)]
+        assert said[0].startswith("robot: arm in the kinematic world")
+        assert said[3] == "velocity_controller/commands has the speeds of slide"
         words = ["--what", "flap", "--hand", "arm/finger", "--to", "3cm", "--world", "ros", "--json"]
         done = subprocess.run(
             [ros_python, "-m", "kineverse", "push", *robot, *words],
@@ -79,7 +81,7 @@ def test_a_skill_moves_an_object_through_topics_alone(ros_python, tmp_path, monk
 @pytest.mark.parametrize("robot", ["hsr", "pr2", "fetch"])
 def test_shipped_robots_open_a_kitchen_through_topics_alone(ros_python, robot, what):
     answer = run_robot(ros_python, "open", "kitchen", robot, what, "--seconds", "120")
-    assert answer["done"], answer["reason"]
+    assert answer.get("done"), answer.get("reason", answer["said"])
     assert answer["true"] == pytest.approx(answer["target"], abs=answer["measures"]["tolerance"])
 
 

@@ -401,6 +401,19 @@ def test_settings_name_topics_joints_and_frames(tmp_path):
     assert names.frame_in_base[0, 3] == 0.1
 
 
+def test_without_settings_one_controller_has_all_joints_sorted_by_name():
+    model = load_robot().copy()
+    with model.edit() as edit:
+        edit.apply(
+            kv.Revolute(name="bot/arm", parent="bot/column", child="bot/hand", axis=(0, 0, 1), velocity=1.0)
+        )
+    names = connect(model, joints={"bot/arm": "z_arm"})
+    assert names.wiring.controllers == (("velocity_controller/commands", 3),)
+    assert [[str(v.position) for v in group] for group in names.controllers] == [
+        ["bot/arm", "bot/lift", "bot/pan"]
+    ]
+
+
 def test_the_settings_on_the_page_can_be_read(tmp_path):
     page = (Path(__file__).parents[2] / "docs" / "ros.md").read_text()
     (block,) = re.findall(r"```toml\n(.*?)```", page, re.DOTALL)

@@ -209,6 +209,10 @@ def test_nearest_pairs_are_shown_and_follow_the_sliders(opened):
     until(page, lambda: not greenish(shot(page)).any())
 
 
+def vivid(image):
+    return image.max(axis=-1) - image.min(axis=-1) > 100
+
+
 def corners(viewer, camera):
     """Project the corners of the scene into the picture of a browser, (N, 2) in [-1, 1] if they are in it."""
     poses = {name: viewer.pose(name) for name in viewer.model.frames}
@@ -244,6 +248,9 @@ def test_the_camera_frames_the_model_in_any_window_until_it_is_moved(browser):
             until(page, lambda folded=folded: (canvas.bounding_box()["height"] > 750) is folded)
             until(page, lambda: canvas.bounding_box()["height"] <= panel.bounding_box()["y"] + 1)
             until(page, lambda: 0.75 < np.abs(corners(viewer, camera)).max() < 0.95)
+            if not folded:
+                # The model is what is seen of the page first: of its red and blue fronts, a tenth of the screen.
+                until(page, lambda: vivid(browsers.shot(page, 390, 844)).mean() > 0.1)
         moved, reports = camera.position + 0.3, []
         client.camera.on_update(lambda camera: reports.append(camera.position.copy()))
         camera.position = moved
@@ -269,4 +276,45 @@ def test_the_camera_frames_the_model_in_any_window_until_it_is_moved(browser):
         page.get_by_text("All constraints hold.").wait_for()
         page.get_by_label("degrees").uncheck()
         until(page, lambda: slider(page, viewer, "cabinet/door").get_attribute("aria-valuenow") == "1.5")
+        page.close()
+
+
+@pytest.mark.long
+def test_a_click_and_a_drag_of_the_gizmo_open_the_drawer(browser):
+    camera = Camera((-1.6, -2.4, 1.6), (0.0, 0.0, 0.5))
+    with view(cabinet(), port=0, camera=camera) as viewer:
+        page = browser.new_page(viewport={"width": 900, "height": 420})
+        page.set_default_timeout(PATIENCE)
+        page.goto(viewer.address)
+        page.wait_for_selector(SLIDERS)
+        page.add_style_tag(content=".mantine-Notifications-root { display: none }")
+        until(page, lambda: reddish(browsers.shot(page, 520, 420)).sum() > 300)
+        (client,) = viewer._server.get_clients().values()
+
+        def pixel(point):
+            eye = client.camera
+            place = Camera(tuple(eye.position), tuple(eye.look_at), field_of_view=eye.fov)
+            right, up, ahead = place.axes @ (np.asarray(point) - eye.position)
+            scale = eye.image_height / 2 / np.tan(eye.fov / 2) / ahead
+            return np.array([eye.image_width / 2 + scale * right, eye.image_height / 2 - scale * up])
+
+        page.mouse.click(*pixel([-0.22, 0.0, 0.7]))
+        until(page, lambda: viewer._drag._gizmo is not None)
+        assert viewer._drag._grip.frame == "cabinet/drawer"
+        # The red arrow points along x, into the cabinet: it is taken near its root, and pulled out.
+        origin = viewer._drag._gizmo.position
+        begin = pixel(origin)
+        along = pixel(np.add(origin, [0.01, 0.0, 0.0])) - begin
+        along *= 40 / np.linalg.norm(along)
+        page.mouse.move(*(begin + along))
+        until(page, lambda: page.evaluate("() => document.querySelectorAll('canvas').length"))
+        page.mouse.down()
+        for share in np.linspace(0.8, -1.0, 10):
+            page.mouse.move(*(begin + share * along))
+        until(page, lambda: viewer.values["cabinet/drawer"] > 0.05)
+        assert viewer.settled()
+        held = viewer._drag._held_pose()[:3, 3]
+        np.testing.assert_allclose(held, viewer._drag._wanted[:3, 3], atol=1e-3)
+        page.mouse.up()
+        until(page, lambda: viewer._drag._holder is None)
         page.close()

@@ -10,7 +10,7 @@ from cupboards import cupboard, state
 from kineverse.cli import main
 from kineverse.errors import UnknownNameError
 from kineverse.planning import Trajectory
-from kineverse.view import view
+from kineverse.view import Camera, view
 from kineverse.view.run_overlay import LONGEST_ARROW, RecordedScene
 from kineverse.worlds import Contact, Recorder, read_run_recording
 
@@ -180,3 +180,34 @@ def test_commands_draw_a_recording_and_a_trajectory(run, tmp_path, capsys):
     ):
         assert main(wrong) == 2
         assert says in capsys.readouterr().err
+
+
+def test_a_recording_has_the_ground_and_the_light_of_its_model(scene):
+    from kineverse.view import picture
+    from kineverse.view.run_overlay import play_recording
+
+    def surroundings(page):
+        nodes = page.server.scene._handle_from_node_name
+        return {
+            name: (type(node).__name__, repr(node._impl.props))
+            for name, node in nodes.items()
+            if name.startswith(("/floor", "/light"))
+        }
+
+    recording, moment = scene.recording, scene.at(0.7)
+    with view(recording.model, port=0) as page:
+        plain = surroundings(page)
+        assert plain.keys() >= {"/floor", "/light/key", "/light/sky", "/light/fill"}
+        play_recording(page, recording, time=0.7)
+        assert page.settled()
+        assert surroundings(page) == plain
+    options = {"size": (96, 72), "camera": Camera((8.0, -6.0, 6.0), (1.0, 0.0, 0.5))}
+    state = scene.values_at(0.7)
+    bare = picture(recording.model, state, **options)
+    ghosts, arrows = scene.drawing.draw_ghosts(moment), scene.drawing.draw_arrows(moment)
+    drawn = picture(recording.model, state, overlay=ghosts, over=arrows, **options)
+    assert (bare != drawn).any()
+    rim = np.ones(bare.shape[:2], dtype=bool)
+    rim[3:-3, 3:-3] = False
+    assert np.abs(bare[rim].astype(int) - drawn[rim]).max() <= 8
+    assert drawn[rim].min() > 120  # nothing is black

@@ -59,7 +59,7 @@ def test_show_in_a_script_waits_until_ctrl_c(monkeypatch, capfd, opened):
 def test_show_without_block_returns_at_once(capfd, opened):
     with kv.show(cabinet(), port=0, block=False, open_browser=False, degrees=True) as page:
         assert page.settled()
-        assert page._panel.degrees
+        assert page._display.degrees
         assert capfd.readouterr().err == f"{page.address}   (page.stop() ends)\n"
         assert repr(page) == f"<page of {page.model!r}, {page.address}>"
     assert opened == []
@@ -75,11 +75,9 @@ def test_show_in_a_notebook_returns_the_page_as_the_result_of_the_cell(monkeypat
     shell = types.SimpleNamespace(kernel=object())
     monkeypatch.setitem(sys.modules, "IPython", types.SimpleNamespace(get_ipython=lambda: shell))
     with show(cabinet(), port=0) as page:
-        assert page._repr_html_() == (
-            f'<iframe style="border:none" src="{page.address}" width="100%" height="600"></iframe>'
-        )
+        assert f'<object style="border:none" data="{page.address}"' in page._repr_mimebundle_()["text/html"]
         assert (capfd.readouterr().err, opened) == ("", [])
-    assert "taken down" in page._repr_html_()
+    assert "taken down" in page._repr_mimebundle_()["text/html"]
 
 
 def test_show_without_a_screen_opens_no_browser(monkeypatch, opened):
@@ -104,7 +102,7 @@ def test_a_real_script_ends_with_ctrl_c(hears_ctrl_c):
         out, err = script.communicate(timeout=60)
     assert "(Ctrl-C ends)" in said
     assert (script.returncode, err) == (0, "\n")
-    assert out.startswith("went on <page of <Model: 1 frames, 1 DoF")
+    assert out.startswith("went on <page of <Model: 1 frame, 1 DoF")
 
 
 def test_show_refuses_other_objects_and_leaves_no_thread():

@@ -7,10 +7,16 @@ from hypothesis import strategies as st
 from small_models import cabinet, dependent
 
 import kineverse as kv
+from kineverse.model.kinematics import infer_units
 from kineverse.view.animation import RangeAnimation
-from kineverse.view.html import MOST_LINES, format_failure, format_violations
+from kineverse.view.html import MOST_LINES, format_failure, format_significant, format_violations
 from kineverse.view.poses import FramePoses, complete, roll_pitch_yaw, to_wxyz
-from kineverse.view.sliders import Ranges, choose_slider_range, choose_slider_step, infer_units
+from kineverse.view.sliders import (
+    DisplayUnits,
+    Ranges,
+    choose_slider_range,
+    choose_slider_step,
+)
 
 INF = math.inf
 LIMIT = st.one_of(st.floats(-10, 10), st.just(INF), st.just(-INF))
@@ -174,3 +180,37 @@ def test_long_reports_are_cut_and_names_are_escaped():
     assert "2 on speeds not checked" in text
     assert "[−∞, 1]" in text
     assert "&lt;b&gt;" in format_failure("<b>")
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (-8.8e-20, "0"),
+        (0.0, "0"),
+        (-0.471234, "−0.4712"),
+        (85.943669, "85.94"),
+        (0.69, "0.69"),
+        (1e-5, "0.00001"),
+        (-12345.6, "−12350"),
+        (INF, "∞"),
+        (-INF, "−∞"),
+        (3e9, "3e+09"),
+    ],
+)
+def test_numbers_have_four_significant_digits(value, text):
+    assert format_significant(value) == text
+
+
+@given(st.floats(1e-8, 1e8) | st.floats(-1e8, -1e-8))
+def test_formatted_numbers_are_near_the_number(value):
+    assert float(format_significant(value).replace("−", "-")) == pytest.approx(value, rel=5.1e-4)
+
+
+def test_numbers_are_shown_in_the_chosen_units():
+    display = DisplayUnits()
+    assert display.format(0.5, "rad") == "0.5 rad"
+    display.degrees = display.centimetres = True
+    assert display.format(math.pi / 2, "rad") == "90 °"
+    assert display.format(0.0345, "m") == "3.45 cm"
+    assert display.scale("m/s") == (100.0, "cm/s")
+    assert display.format(3.0, "") == "3"

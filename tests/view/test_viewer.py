@@ -60,7 +60,7 @@ def test_move_and_reset(page):
 def test_angles_are_shown_in_degrees_on_demand_also_after_edits(page):
     page.move({"cabinet/door": 0.5, "cabinet/drawer": 0.1})
     assert page.settled()
-    page._panel._convert(True)
+    page._panel._convert(degrees=True)
     door = pytest.approx(np.degrees(0.5))
     assert sliders(page)["cabinet/door"] == ("door [°]   0 to 85.94", 0.0, np.degrees(1.5), door)
     assert sliders(page)["cabinet/drawer"] == ("drawer [m]   0 to 0.4", 0.0, 0.4, 0.1)
@@ -69,13 +69,39 @@ def test_angles_are_shown_in_degrees_on_demand_also_after_edits(page):
     assert sliders(page)["cabinet/door"][0] == "door [°]   0 to 85.94"
     assert "114.6 is not in [0, 85.94], by 28.65 °" in page._panel._status.content
     assert page._panel._value("cabinet/door") == pytest.approx(2.0)
+    assert page._panel._sliders["cabinet/door"].hint == "cabinet/door, limits 0 to 85.94 °"
     with page.model.edit() as edit:
         edit.constrain("cabinet/knob/range", -1, kv.position("cabinet/knob"), 0.0123)
     assert page.settled()
-    assert sliders(page)["cabinet/knob"][0] == "knob [°]   −57.3 to 0.7"
-    page._panel._convert(False)
-    assert sliders(page)["cabinet/knob"][:3] == ("knob [rad]   −1 to 0.012", -1.0, 0.0123)
+    assert sliders(page)["cabinet/knob"][0] == "knob [°]   −57.3 to 0.7047"
+    page._panel._convert(degrees=False)
+    assert sliders(page)["cabinet/knob"][:3] == ("knob [rad]   −1 to 0.0123", -1.0, 0.0123)
     assert page.values["cabinet/door"] == 2.0
+
+
+def test_lengths_are_shown_in_centimetres_in_sliders_hints_and_violations(page):
+    page._panel._convert(centimetres=True)
+    page.move({"cabinet/drawer": 0.5})
+    assert page.settled()
+    # The slider goes beyond the limits, which are those of the joint in its label.
+    assert sliders(page)["cabinet/drawer"] == ("drawer [cm]   0 to 40", 0.0, 50.0, 50.0)
+    assert page._panel._sliders["cabinet/drawer"].hint == "cabinet/drawer, limits 0 to 40 cm"
+    assert "50 is not in [0, 40], by 10 cm" in page._panel._status.content
+
+
+def test_sums_of_angles_that_are_violated_are_shown_in_degrees(page):
+    door, knob, drawer = (kv.position(f"cabinet/{name}") for name in ("door", "knob", "drawer"))
+    with page.model.edit() as edit:
+        edit.constrain("sum", -1, door + knob, 1)
+        edit.constrain("lead", -1, 3 * door, 1)  # whose factor may have a unit
+        edit.constrain("mixed", -1, door + drawer, 1)
+    page._panel._convert(degrees=True)
+    page.move({"cabinet/door": 1.2})
+    assert page.settled()
+    content = page._panel._status.content
+    assert "68.75 is not in [−57.3, 57.3], by 11.46 °" in content
+    assert "3.6 is not in [−1, 1], by 2.6<" in content
+    assert "1.2 is not in [−1, 1], by 0.2<" in content
 
 
 def test_limits_that_are_zero_but_for_rounding_are_labelled_zero():

@@ -1,10 +1,11 @@
-"""Draw the pictures of the docs: the gallery, proximity, and the demo. With names, some of them."""
+"""Draw the pictures and clips of the docs. With names or patterns, some of them."""
 
 from __future__ import annotations
 
 import argparse
-import io
 import sys
+from collections.abc import Callable, Mapping
+from fnmatch import fnmatchcase
 from pathlib import Path
 
 import living
@@ -12,48 +13,75 @@ import lockbox
 import near
 import numpy as np
 from configurations import TAKES, Take, values
-from PIL import Image
+from example_pictures import EXAMPLE_PICTURES, MOVING_EXAMPLES
+from films import FILMS, draw_film
+from peers import PEERS, draw_peer, draw_targets
+from scene_cameras import fit_scene_camera
+from skills import SKILL_PICTURES
+from small_files import encode_small_clip, encode_small_picture
+from study_figures import STUDIES, draw_study
+from tour import draw_tour
 
 import kineverse as kv
 from kineverse import gallery
 from kineverse.view import picture
-from kineverse.view.camera import Camera, fit_camera
-from kineverse.view.drawables import collect_drawables
-from kineverse.view.poses import FramePoses, complete
-from kineverse.view.rasterizer import TriangleSoup
+from kineverse.view.poses import complete
 
 FOLDER = Path(__file__).resolve().parents[2] / "docs" / "pictures"
 WIDTH, GAP = 480, 4
-LARGEST = 24_000
-OTHERS = {
-    "near": near.draw_proximity,
-    "living": living.draw_living_kitchen,
-    "lockbox": lockbox.draw_thesis_box,
-}
+
+Drawn = np.ndarray | list[np.ndarray]
+
+
+def list_pictures() -> Mapping[str, Callable[[], Drawn]]:
+    """Return the functions that draw the pictures, by file name."""
+    found: dict[str, Callable[[], Drawn]] = {}
+    for name, take in TAKES.items():
+        found[f"{name}.png"] = lambda name=name, take=take: draw_gallery_scene(name, take)
+    for name in FILMS:
+        found[f"{name}.webp"] = lambda name=name: draw_film(name)
+    for name, draw in EXAMPLE_PICTURES.items():
+        found[f"{name}.{'webp' if name in MOVING_EXAMPLES else 'png'}"] = draw
+    for name in PEERS:
+        found[f"{Path(name).name}.png"] = lambda name=name: draw_peer(name)
+    for name in STUDIES:
+        found[f"reproduce_{name}.png"] = lambda name=name: draw_study(name)
+    return (
+        found
+        | {f"{name}.png": draw for name, draw in SKILL_PICTURES.items()}
+        | {
+            "near.png": near.draw_proximity,
+            "living.png": living.draw_living_kitchen,
+            "lockbox.png": lockbox.draw_thesis_box,
+            "inverse_kinematics_ur10.png": draw_targets,
+            "open_close.webp": draw_tour,
+        }
+    )
 
 
 def main() -> int:
-    """Draw what was asked for; return how many scenes nobody says how to draw."""
+    """Draw what was asked for; return how many scenes and names nobody says how to draw."""
     parser = argparse.ArgumentParser(prog="python tools/pictures", description=__doc__)
-    parser.add_argument("names", nargs="*", metavar="NAME", help="scenes (all)")
-    missing = 0
-    for name in parser.parse_args().names or (*gallery.names(), *OTHERS):
-        if name in OTHERS:
-            write(name, OTHERS[name]())
-            continue
-        if name not in TAKES:
+    parser.add_argument("names", nargs="*", metavar="NAME", help="names or patterns, such as '1*' (all)")
+    known, missing = list_pictures(), 0
+    for name in sorted(set(gallery.names()) - set(TAKES)):
+        missing += 1
+        sys.stderr.write(f"configurations.py does not say how '{name}' is drawn\n")
+    for pattern in parser.parse_args().names or ["*"]:
+        chosen = [name for name in known if fnmatchcase(name, pattern) or Path(name).stem == pattern]
+        if not chosen:
             missing += 1
-            sys.stderr.write(f"configurations.py does not say how '{name}' is drawn\n")
-            continue
-        write(name, draw_gallery_scene(name, TAKES[name]))
+            sys.stderr.write(f"there is no picture '{pattern}'\n")
+        for name in chosen:
+            write(name, known[name]())
     return missing
 
 
-def write(name: str, pixels: np.ndarray) -> None:
-    """Write a picture to the folder of pictures, and say how large it is."""
-    data = encoded(pixels)
-    (FOLDER / f"{name}.png").write_bytes(data)
-    sys.stdout.write(f"{name}.png: {len(data)} bytes\n")
+def write(name: str, drawn: Drawn) -> None:
+    """Write a picture or a clip to the folder of pictures, and say how large it is."""
+    data = encode_small_clip(name, drawn) if isinstance(drawn, list) else encode_small_picture(name, drawn)
+    (FOLDER / name).write_bytes(data)
+    sys.stdout.write(f"{name}: {len(data)} bytes\n")
 
 
 def draw_gallery_scene(name: str, take: Take) -> np.ndarray:
@@ -78,34 +106,10 @@ def draw_gallery_scene(name: str, take: Take) -> np.ndarray:
         violated = model.violations(kv.State(state))
         if violated:
             raise ValueError(f"{name} at {state}: {violated}")
-    eye = camera(model, states, take, size[0] / size[1])
+    eye = fit_scene_camera(model, states, take.azimuth, take.elevation, size[0] / size[1])
     panels = [picture(model, state, size, eye) for state in states]
     gap = np.full((take.height, GAP, 3), 255, dtype=np.uint8)
     return np.concatenate([part for panel in panels for part in (panel, gap)][:-1], axis=1)
-
-
-def camera(model: kv.Model, states: list[dict[str, float]], take: Take, aspect: float) -> Camera:
-    """Return a camera that has the scene in all its states in the picture."""
-    poses, items = FramePoses(model), collect_drawables(model)
-    corners = [
-        TriangleSoup.from_drawables(
-            items, dict(zip(poses.names, poses.evaluate(state), strict=True))
-        ).corners.reshape(-1, 3)
-        for state in states
-    ]
-    return fit_camera(np.concatenate(corners), take.azimuth, take.elevation, aspect, 0.4, margin=0.04)
-
-
-def encoded(pixels: np.ndarray) -> bytes:
-    """Return a PNG with a palette, with as many colours as fit."""
-    image = Image.fromarray(pixels)
-    for colors in (256, 192, 128, 96, 64):
-        file = io.BytesIO()
-        # A mark has few pixels; refined by k-means, its colour is kept.
-        image.quantize(colors, kmeans=4, dither=Image.Dither.NONE).save(file, "PNG", optimize=True)
-        if file.tell() <= LARGEST:
-            break
-    return file.getvalue()
 
 
 if __name__ == "__main__":

@@ -74,6 +74,11 @@ class _Tables:
                 raise UnknownNameError(f"omit has '{key}', which names nothing. {suggest(key, names)}")
         output = ModelOutput(model, settings.omit)
         joints = dict.fromkeys([*output.joints, *model.articulations])
+        if settings.robot and not any(covers(f"{settings.robot.rstrip('/')}/", name) for name in joints):
+            raise UnknownNameError(
+                f"robot is '{settings.robot}', and no joint of the model is below that name. The robot is "
+                f"one of the models: kineverse ros kitchen {settings.robot} --robot {settings.robot}."
+            )
         return cls(
             model,
             output,

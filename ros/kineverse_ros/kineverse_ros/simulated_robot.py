@@ -234,6 +234,9 @@ def simulate_robot(
     say(f"out: {wiring.joint_states}, /tf, poses of {len(wiring.poses)} frames")
     topics = [topic for topic, _ in wiring.controllers]
     say(f"in: {', '.join(filter(None, [wiring.command, *topics, wiring.trajectory]))}")
+    for topic, speeds in zip(topics, names.controllers, strict=True):
+        joints = ", ".join(names.joints.to_ros(str(v.position)) for v in speeds)
+        say(f"{topic} has the speeds of {joints}")
     try:
         run_in_real_time(ros, node, simulation)
     finally:

@@ -240,7 +240,7 @@ class Ackermann(Base, document_kind="Ackermann"):
 
     Coordinates are x, y [m], θ [rad] and the steering angle ``name/steering``, δ [rad], of a wheel in the
     middle of the front axle, positive to the left. Speeds are that of the rear axle, v = ``name/drive``
-    [m/s], and δ̇. With the wheelbase L,
+    [m/s], and δ̇. With the wheelbase L::
 
         ẋ = v cos θ,        ẏ = v sin θ,        θ̇ = v tan(δ)/L.
 
@@ -311,7 +311,7 @@ class Mecanum(Base, document_kind="Mecanum"):
 
     The coordinates x, y [m] and θ [rad] move by the speeds of the four wheels, front left, front right, rear
     left, rear right, each positive where it drives forward. With the radius r, the track b and the wheelbase
-    L, the velocity and the angular speed in the axes of the base are
+    L, the velocity and the angular speed in the axes of the base are::
 
         v_x = r/4 ( ω_fl + ω_fr + ω_rl + ω_rr)
         v_y = r/4 (-ω_fl + ω_fr + ω_rl - ω_rr)

@@ -93,7 +93,7 @@ def position_lock(
 
     Note that a position that is *outside* already is free, and free to return. A bolt that springs out
     while the door stands open holds nothing; it holds the door once that is shut. With c = open_if, the
-    bounds are
+    bounds are::
 
         locked = ~c & (lower - margin < q) & (q < upper + margin)
         lower  = where(locked, lower, -∞),     upper = where(locked, upper, ∞)

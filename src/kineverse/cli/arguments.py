@@ -11,26 +11,24 @@ import json
 import math
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from fnmatch import fnmatchcase
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import kineverse as kv
 from kineverse._extras import install_command
+from kineverse._names import is_pattern, match_names
 from kineverse.compilation.toolchain import no_compiler, toolchain
 from kineverse.errors import (
     CompileError,
     DuplicateNameError,
     InvalidValueError,
     MissingDependencyError,
-    UnknownNameError,
-    suggest,
 )
 from kineverse.expressions.printing import format_number
 from kineverse.formats.file_formats import is_mjcf
+from kineverse.model.kinematics import infer_units
 from kineverse.model.registry import find_scheme
-from kineverse.view.sliders import infer_units
 
 from .output import format_cells, print_line
 
@@ -100,6 +98,16 @@ def parse_length(text: str) -> float:
     if match is None or match["unit"] not in LENGTHS or match["pi"]:
         raise InvalidValueError(f"{text.strip()!r} is not a length; write a number of m (0.05), or 5cm, 2mm")
     return parse_value(text)
+
+
+def parse_pose_numbers(texts: Sequence[str]) -> tuple[float, ...]:
+    """Return the numbers of X, Y, Z [m], and of ROLL, PITCH, YAW [rad] that may follow."""
+    for text in texts[3:]:
+        if unit_kind(text) == "m":
+            raise InvalidValueError(
+                f"{text.strip()!r} is not an angle; write a number of rad (0.5), or 30deg"
+            )
+    return (*map(parse_length, texts[:3]), *map(parse_value, texts[3:]))
 
 
 def parse_value(text: str) -> float:
@@ -231,6 +239,16 @@ def find_limit_notes(model: ModelView, values: Mapping[str, float], texts: Itera
     return lines
 
 
+def check_assigned_units(model: ModelView, texts: Iterable[str], option: str) -> None:
+    """Raise InvalidValueError for a length that is assigned to an angle, and the other way round."""
+    given = {text.rpartition("=")[0].strip(): text for text in texts if has_unit(text)}
+    if not given:
+        return
+    values = {str(symbol): value for symbol, value in model.default_state().items()}
+    for name, unit in infer_units(model, values, given).items():
+        check_unit(option, given[name], name, unit)
+
+
 def check_unit(option: str, text: str | None, coordinate: object, unit: str) -> None:
     """Raise InvalidValueError for a value in a unit of lengths or angles that is not its coordinate's."""
     stated = unit_kind(text or "")
@@ -253,16 +271,9 @@ def find_turn_notes(texts: Iterable[str]) -> list[str]:
 def match_coordinates(model: ModelView, words: Iterable[str], option: str) -> list[str]:
     """Return the names of an option, with those of coordinates in place of patterns such as ``kitchen/*``."""
     names = [str(symbol) for symbol in model.degrees_of_freedom]
-    found: list[str] = []
-    for word in words:
-        matching = [word]
-        if any(sign in word for sign in "*?["):
-            matching = [name for name in names if fnmatchcase(name, word)]
-            if not matching:
-                similar = suggest(word, names, "coordinate")
-                raise UnknownNameError(f"{option} {word}: no coordinate matches. {similar}")
-        found += matching
-    return found
+    # The library knows what else a name may stand for.
+    parts = (match_names(w, names, "coordinate", option) if is_pattern(w) else (w,) for w in words)
+    return [name for part in parts for name in part]
 
 
 def print_notes(lines: Iterable[str]) -> None:

@@ -13,7 +13,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from traceback import walk_tb
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Protocol, TextIO, cast
+from typing import TYPE_CHECKING, Any, NoReturn, Protocol, TextIO, cast
 
 from kineverse._extras import ROS, STUDIES, install_command, install_distribution
 from kineverse._version import __version__
@@ -42,7 +42,7 @@ class CommandModule(Protocol):
 COMMANDS: Mapping[str, tuple[str, str]] = MappingProxyType(
     {
         "info": ("info", "print the contents of a model: frames, degrees of freedom, constraints, size"),
-        "fk": ("fk", "print the pose of a frame at given positions"),
+        "fk": ("info:FK", "print the pose of a frame at given positions"),
         "reach": ("reach", "find positions in which a frame has a pose: inverse kinematics"),
         "plan": ("plan", "find a path without collisions"),
         "unlock": ("unlock", "find the order in which locked parts have to move"),
@@ -80,6 +80,7 @@ COMMANDS: Mapping[str, tuple[str, str]] = MappingProxyType(
         "undo": ("exchange:UNDO", "take back a commit of a served model"),
         "dump": ("exchange:DUMP", "write a backup of a served model, or a document of it"),
         "apply": ("exchange:APPLY", "add the operations of a file to a served model"),
+        "cache": ("cache", "print what is kept on the disk to be fast, and remove it"),
         "live": (
             "live_system",
             "let a robot open and close a kitchen, live: world, estimators, behaviour, page",
@@ -292,7 +293,7 @@ def load_command(name: str) -> CommandModule:
 
 def make_parser(name: str | None = None) -> argparse.ArgumentParser:
     """Return the parser of the command line with the options of one command; None only lists commands."""
-    top = argparse.ArgumentParser(
+    top = _Parser(
         prog="kineverse",
         description="View, move and query articulation models.",
         epilog=EXAMPLES,
@@ -325,9 +326,19 @@ def make_parser(name: str | None = None) -> argparse.ArgumentParser:
 
 def _parse_arguments(words: Sequence[str]) -> argparse.Namespace:
     name = next((word for word in words if not word.startswith("-")), None)
+    if name is not None and words[0] in ("-h", "--help"):
+        words = [name, words[0]]  # help of the command, wherever it is asked for
     # A leading space tells argparse that -30deg, -pi/2 or -1e-3 is a value and no option.
     words = [f" {word}" if _NEGATIVE_VALUE.match(word) else word for word in words]
-    arguments, unknown = make_parser(name).parse_known_args(words)
+    try:
+        arguments, unknown = make_parser(name).parse_known_args(words)
+    except _UsageError as error:
+        # A misspelt option is why another one is missing.
+        known, asked = error.parser._option_string_actions, [w.partition("=")[0] for w in words]
+        for word in asked:
+            if word.startswith("--") and len(word) > 2 and not any(o.startswith(word) for o in known):
+                raise _unknown_option_error(error.parser, word) from None
+        argparse.ArgumentParser.error(error.parser, str(error))
     if unknown:
         sub: argparse.ArgumentParser = arguments.command
         word = unknown[0].partition("=")[0]
@@ -340,9 +351,26 @@ def _parse_arguments(words: Sequence[str]) -> argparse.Namespace:
             raise UnknownNameError(
                 f"{sub.prog} takes no argument {word!r}. '{sub.prog} --help' lists those that it takes."
             )
-        options = [option for option in sub._option_string_actions if option.startswith("--")]
-        raise UnknownNameError(f"{sub.prog} has no option {word!r}. {suggest(word, options, 'option')}")
+        raise _unknown_option_error(sub, word)
     return arguments
+
+
+class _UsageError(Exception):
+    def __init__(self, parser: argparse.ArgumentParser, message: str) -> None:
+        super().__init__(message)
+        self.parser = parser
+
+
+class _Parser(argparse.ArgumentParser):
+    """Parser that raises an error of usage, in place of printing it at once."""
+
+    def error(self, message: str) -> NoReturn:
+        raise _UsageError(self, message)
+
+
+def _unknown_option_error(parser: argparse.ArgumentParser, word: str) -> UnknownNameError:
+    options = [option for option in parser._option_string_actions if option.startswith("--")]
+    return UnknownNameError(f"{parser.prog} has no option {word!r}. {suggest(word, options, 'option')}")
 
 
 def _list_summaries() -> dict[str, str]:

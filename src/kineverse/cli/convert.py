@@ -20,7 +20,7 @@ from kineverse.model.registry import FrameDeviation, SaveResult, find_scheme, wr
 
 from .arguments import add_model_options, load_model
 from .diff import format_pose_difference
-from .output import count_contents, format_contents, format_count, show_activity, truncate_lines
+from .output import count_contents, format_bytes, format_contents, format_count, show_activity, truncate_lines
 
 if TYPE_CHECKING:
     import kineverse as kv
@@ -190,7 +190,7 @@ def check_writable(target: str, source: str, force: bool = False) -> None:
 def _format_report(
     arguments: argparse.Namespace, model: kv.Model, size: int, left_out: list[str], saved: SaveResult
 ) -> list[str]:
-    lines = [f"{arguments.source} → {arguments.target}", f"  {format_contents(model)}, {_format_size(size)}"]
+    lines = [f"{arguments.source} → {arguments.target}", f"  {format_contents(model)}, {format_bytes(size)}"]
     if saved.errors:
         lines.append(f"  {_approximation_errors(saved)}")
     most = None if arguments.all else SHOWN
@@ -254,13 +254,6 @@ def _check_as_json(check: ConversionCheck) -> dict[str, object]:
         "cause": check.cause,
         "remarks": list(check.remarks),
     }
-
-
-def _format_size(size: int) -> str:
-    for unit, factor in (("MiB", 1 << 20), ("KiB", 1 << 10)):
-        if size >= factor:
-            return f"{size / factor:.3g} {unit}"
-    return format_count(size, "byte")
 
 
 def _as_json(

@@ -11,7 +11,8 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from kineverse.errors import InvalidValueError, KineverseError, UnknownNameError, suggest
+from kineverse._names import match_names, matches_pattern
+from kineverse.errors import InvalidValueError, KineverseError, UnknownNameError
 from kineverse.expressions.printing import format_number
 from kineverse.geometry.decomposition import (
     DecompositionSettings,
@@ -81,7 +82,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "names", metavar="MODEL_OR_MESH", nargs="*", help="name or path of a model, or a mesh file"
     )
     add_model_options(parser)
-    parser.add_argument("--links", metavar="LINK", nargs="+", help="only the meshes of these links")
+    parser.add_argument(
+        "--links", metavar="LINK", nargs="+", help="only the meshes of these links (or patterns)"
+    )
     parser.add_argument("--max-hulls", metavar="N", type=int, help="largest number of hulls of a mesh (32)")
     parser.add_argument(
         "--error",
@@ -157,15 +160,12 @@ def _tasks(arguments: argparse.Namespace) -> tuple[list[MeshTask], dict[str, str
             continue
         for link, mesh in meshes:
             with_meshes.add(link)
-            if links is None or link in links:
+            if links is None or matches_pattern(link, links):
                 task = tasks.setdefault(mesh, MeshTask(mesh))
                 task.links += [] if link in task.links else [link]
     if not unread:
         # Otherwise the link may belong to a model that cannot be read.
-        for link in links or ():
-            if link not in with_meshes:
-                similar = suggest(link, with_meshes, "link with a mesh")
-                raise UnknownNameError(f"No link {link!r} has a mesh. {similar}")
+        match_names(links or (), sorted(with_meshes), "link with a mesh", "--links")
     return list(tasks.values()), unread
 
 

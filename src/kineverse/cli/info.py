@@ -1,17 +1,18 @@
-"""``kineverse info``: contents of a model, and the list of articulations."""
+"""``kineverse info`` and ``fk``: contents of a model, the list of articulations, the pose of a frame."""
 
 from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+import kineverse as kv
 from kineverse import formats, gallery
-from kineverse.errors import KineverseError
+from kineverse.errors import InvalidValueError, KineverseError
 from kineverse.expressions.printing import format_number
 from kineverse.formats import shipped_models
 from kineverse.formats.file_formats import DOCUMENT_SUFFIXES
@@ -21,15 +22,22 @@ from kineverse.geometry import DistanceResult, Scene
 from kineverse.geometry.exclusions import find_unusable_shapes, is_installed
 from kineverse.geometry.objects import bodies_with_visual_collision
 from kineverse.geometry.shapes import import_coal
+from kineverse.lie import to_quaternion
 from kineverse.model.constraint import Constraint
+from kineverse.model.display import DofSummary, order_depth_first, summarize_freedoms
 from kineverse.model.model_view import ModelView
 from kineverse.reasoning import Interlocks, interlocks
-from kineverse.symbols import Symbol
 from kineverse.view.drawables import collect_drawables
-from kineverse.view.poses import FramePoses, complete
-from kineverse.view.sliders import infer_units
+from kineverse.view.poses import FramePoses, complete, roll_pitch_yaw
 
-from .arguments import add_model_options, load_model
+from .arguments import (
+    add_model_options,
+    add_set_option,
+    find_limit_notes,
+    load_model,
+    parse_assignments,
+    print_notes,
+)
 from .output import format_count, format_table, truncate_lines
 
 if TYPE_CHECKING:
@@ -97,7 +105,7 @@ def format_sections(summary: ModelSummary, frames: bool = False, constraints: bo
     sections = ["\n".join(lines)]
     if summary.freedoms:
         rows = [(name, unit, *map(format_number, numbers)) for name, unit, *numbers in summary.freedoms]
-        sections.append(format_table(("DoF", *DofSummary._fields[1:]), rows, "<<>>>>"))
+        sections.append(format_table(("DoF", *DofSummary._fields[1:-1], "speed [/s]"), rows, "<<>>>>"))
     if summary.interlocks:
         sections.append("\n".join(["interlocks", *(f"  {interlock}" for interlock in summary.interlocks)]))
     locking = {name for interlock in summary.interlocks for name in interlock.constraints}
@@ -106,7 +114,8 @@ def format_sections(summary: ModelSummary, frames: bool = False, constraints: bo
         title = "constraint" if constraints else "other constraints"
         sections.append(format_table((title, ""), [(c.name, c.text) for c in shown]))
     if frames:
-        sections.append("frames\n" + "\n".join(_format_tree(summary.frames)))
+        tree = order_depth_first(summary.frames)
+        sections.append("frames\n" + "\n".join("  " * (depth + 1) + name for name, depth in tree))
     hidden = [] if frames else ["--frames"]
     if not constraints and len(shown) < len(summary.constraints):
         hidden.append("--constraints")
@@ -155,19 +164,6 @@ def _format_contacts(pairs: Sequence[DistanceResult]) -> str:
     if len(pairs) == 1:
         return f"  1 pair of bodies touches at the default state: {deepest}"
     return f"  {len(pairs)} pairs of bodies touch at the default state, first {deepest}"
-
-
-def _format_tree(frames: dict[str, str]) -> list[str]:
-    """Return the frames in depth-first order, each indented by two spaces more than its parent."""
-    children: dict[str, list[str]] = {}
-    for name, parent in frames.items():
-        children.setdefault(parent, []).append(name)
-    lines, stack = [], [(name, 1) for name in reversed(children.get("world", []))]
-    while stack:
-        name, depth = stack.pop()
-        lines.append("  " * depth + name)
-        stack.extend((child, depth + 1) for child in reversed(children.get(name, [])))
-    return lines
 
 
 def is_gallery_list(model: str) -> bool:
@@ -222,17 +218,6 @@ def find_penetrations(model: ModelView) -> Iterator[ModelProblem]:
             yield ModelProblem("contact", pair.a, text)
 
 
-class DofSummary(NamedTuple):
-    """Degree of freedom: limits and default value [unit], and largest speed [unit/s]."""
-
-    name: str
-    unit: str
-    lower: float
-    upper: float
-    default: float
-    speed: float
-
-
 class ConstraintSummary(NamedTuple):
     """Constraint as text; ``simple`` is True if it bounds a single symbol by numbers."""
 
@@ -248,7 +233,7 @@ class ModelSummary:
 
     name: str  # name or path of the model, as given
     frames: dict[str, str]  # parents of the frames, by name
-    freedoms: list[DofSummary]  # degrees of freedom
+    freedoms: list[DofSummary]
     constraints: list[ConstraintSummary]
     low: list[float]  # bounding box of all shapes at the default state [m]
     high: list[float]
@@ -279,15 +264,11 @@ def summarize_model(name: str, model: ModelView) -> ModelSummary:
     ]
     corners = np.concatenate(placed or [np.array([pose[:3, 3] for pose in pose_of.values()])])
     low, high = corners.min(axis=0), corners.max(axis=0)
-    unit = infer_units(model, values, map(str, model.degrees_of_freedom))
     masses = (body.inertia.mass for body in model.bodies.values() if body.inertia is not None)
     return ModelSummary(
         name=name,
         frames={frame: model.frames[frame].parent for frame in model.frames},
-        freedoms=[
-            _summarize_dof(model, symbol, unit[str(symbol)], values[str(symbol)])
-            for symbol in model.degrees_of_freedom
-        ],
+        freedoms=summarize_freedoms(model),
         constraints=[_summarize_constraint(key, constraint) for key, constraint in model.constraints.items()],
         low=low.tolist(),
         high=high.tolist(),
@@ -301,12 +282,6 @@ def summarize_model(name: str, model: ModelView) -> ModelSummary:
         contacts=find_contacts(model),
         sha256=formats.document.document_hash(model) if name.endswith(DOCUMENT_SUFFIXES) else "",
     )
-
-
-def _summarize_dof(model: ModelView, symbol: Symbol, unit: str, default: float) -> DofSummary:
-    lower, upper = model.limits(symbol)
-    slowest, fastest = model.limits(symbol.derivative())
-    return DofSummary(str(symbol), unit, lower, upper, default, max(abs(slowest), abs(fastest)))
 
 
 def _summarize_constraint(name: str, constraint: Constraint) -> ConstraintSummary:
@@ -324,3 +299,80 @@ def _format_bound(expression: object) -> str:
         return f"{float(text) + 0.0:.4g}"  # no minus before a zero
     except ValueError:
         return text
+
+
+# -- pose of a frame -----------------------------------------------------------------------------------------
+
+
+class PoseCommand(NamedTuple):
+    """Command that prints the pose of a frame."""
+
+    HELP: str
+    add_arguments: Callable[[argparse.ArgumentParser], None]
+    run: Callable[[argparse.Namespace], int]
+
+
+def _add_fk_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("model", metavar="MODEL", help="name of a shipped model, or path of a file")
+    parser.add_argument("frame", metavar="FRAME", help="name of a frame, such as kitchen/fridge_door")
+    parser.add_argument("--relative-to", metavar="FRAME", default="world", help="reference frame (world)")
+    add_set_option(parser)
+    add_model_options(parser)
+    parser.add_argument("--json", action="store_true", help="one JSON object on standard output")
+
+
+def _run_fk(arguments: argparse.Namespace) -> int:
+    """Evaluate the pose and print it."""
+    # Parsed before the model is loaded, so that a typing error is reported at once.
+    assigned = parse_assignments(arguments.assignments)
+
+    model = load_model(arguments, arguments.model)
+    expression = model.fk(arguments.frame, arguments.relative_to)
+    values = complete(model, assigned)
+    pose = np.asarray(expression(kv.State(values)), dtype=float)
+    notes = find_limit_notes(model, values, arguments.assignments)
+    used = {str(s): values[str(s)] for s in expression.symbols if str(s) in values}
+    if not np.isfinite(pose).all():
+        print_notes(notes)
+        where = ", ".join(f"{name}={format_number(value, 6)}" for name, value in used.items()) or "all values"
+        raise InvalidValueError(
+            f"The pose of '{arguments.frame}' in '{arguments.relative_to}' is not finite at {where}; "
+            "set other positions with --set."
+        )
+    position, rpy = pose[:3, 3], roll_pitch_yaw(pose)
+    xyzw = to_quaternion(pose[:3, :3])
+    if arguments.json:
+        answer = {
+            "frame": arguments.frame,
+            "relative_to": arguments.relative_to,
+            "transform": pose.tolist(),
+            "position": position.tolist(),
+            "quaternion_xyzw": xyzw.tolist(),
+            "roll_pitch_yaw": rpy.tolist(),
+            "depends_on": used,
+        }
+        print(json.dumps(answer, allow_nan=False))
+    else:
+        print(f"{arguments.frame} in {arguments.relative_to}")
+        print("\n".join("  " + "".join(f"{format_number(x, 6):>12}" for x in row) for row in pose))
+        rows = ("position", position, "m"), ("roll pitch yaw", rpy, "rad"), ("quaternion xyzw", xyzw, "")
+        for name, numbers, unit in rows:
+            cells = "".join(f"{format_number(x, 6):>12}" for x in numbers)
+            print(f"  {name:<16}{cells}  {unit}".rstrip())
+        if used:
+            print("  at " + ", ".join(f"{name}={format_number(value, 6)}" for name, value in used.items()))
+    print_notes(notes)
+    return 0
+
+
+FK = PoseCommand(
+    """\
+Positions that are not set have their defaults: 0, or the nearest value within the limits.
+
+examples:
+  kineverse fk kitchen kitchen/fridge_door_handle
+  kineverse fk kitchen kitchen/fridge_door_handle --set kitchen/fridge_door=30deg --json
+  kineverse fk pr2 pr2/l_gripper_tool_frame --relative-to pr2/torso_lift_link""",
+    _add_fk_arguments,
+    _run_fk,
+)

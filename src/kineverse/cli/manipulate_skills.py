@@ -19,13 +19,20 @@ from kineverse.manipulation import JudgedOutcome, PlacedRobot, Robot, Session, j
 from kineverse.manipulation.articulated_objects import find_shut_value
 from kineverse.manipulation.outcome import Outcome
 from kineverse.manipulation.skill_run import choose_tolerance, explain_fixed
+from kineverse.model.kinematics import infer_units
 from kineverse.model.model import Model
 from kineverse.state import State
 from kineverse.symbols import Symbol
-from kineverse.view.sliders import infer_units
 from kineverse.worlds import RobotInterface, RunMetrics, SimulatedWorld
 
-from .arguments import check_unit, load_model, parse_assignments, parse_value, print_notes
+from .arguments import (
+    check_assigned_units,
+    check_unit,
+    load_model,
+    parse_assignments,
+    parse_value,
+    print_notes,
+)
 from .output import join_lines, print_line, show_activity
 from .outside_robot import check_served, is_live
 from .plan_arguments import find_robot_name, parse_robot
@@ -156,6 +163,7 @@ def _parse_other_positions(
 ) -> dict[Symbol, float]:
     """Return the values of ``--set``, of anything but the coordinate that is to change."""
     given = {model.symbol(name): value for name, value in parse_assignments(texts).items()}
+    check_assigned_units(model, texts, "--set")
     if coordinate in given:
         raise InvalidValueError(f"--set {coordinate}: --from VALUE says where it is at the start.")
     for symbol, value in given.items():

@@ -220,6 +220,14 @@ def format_markdown(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     return "\n".join(f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in row)} |" for row in lines)
 
 
+def format_bytes(size: int) -> str:
+    """Return a size with its unit: ``"45 MiB"``."""
+    for unit, factor in (("GiB", 1 << 30), ("MiB", 1 << 20), ("KiB", 1 << 10)):
+        if size >= factor:
+            return f"{size / factor:.4g} {unit}" if size >= 1000 * factor else f"{size / factor:.3g} {unit}"
+    return f"{size} B"
+
+
 def format_cells(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     """Return a table of names and, aligned to the right, of what is known about them."""
     return format_table(head, rows, "<" + ">" * (len(head) - 1))

@@ -182,9 +182,10 @@ class OutsideRobot(AbstractContextManager["OutsideRobot"]):
     def look(self) -> State:
         """Return the believed state when the object has been seen for a while."""
         interface, coordinate = self.interface, self._coordinate
-        begin, seen = time.monotonic(), None
+        begin = seen = None
         while seen is None or time.monotonic() < seen + _SETTLING:
             state = self.belief.update(interface.observe(), interface.time)
+            begin = begin or time.monotonic()  # after the first, which prepares the estimator
             if seen is None and coordinate in getattr(self.belief, "seen", {}):
                 seen = time.monotonic()
             if seen is None and time.monotonic() > begin + _LOOKING:

@@ -68,13 +68,18 @@ def print_mesh_problems(problems: list[str]) -> None:
         print(f"kineverse: shown as placeholders: {problems[0]}{more}", file=sys.stderr)
 
 
-def check_picture_path(path: str | None) -> None:
-    """Raise unless a picture can be written, before the work; None stands for no picture."""
+def check_picture_path(path: str | None, clips: bool = False) -> None:
+    """Raise unless a picture can be written, before the work; None stands for no picture.
+
+    ``clips`` says whether the picture may be a clip.
+    """
     if path is None:
         return
+    from kineverse.view.clips import is_clip_name  # for start-up time
     from kineverse.view.pictures import check_png_name  # for start-up time
 
-    check_png_name(path)
+    if not (clips and is_clip_name(path)):
+        check_png_name(path)
     check_file_path(path)
 
 

@@ -21,7 +21,14 @@ from kineverse.planning import Planner
 from kineverse.planning.trajectories.trajectory import check_trajectory_name
 from kineverse.worlds import Robot
 
-from .arguments import add_model_options, load_model, needs_mujoco, parse_length, require
+from .arguments import (
+    add_model_options,
+    check_assigned_units,
+    load_model,
+    needs_mujoco,
+    parse_length,
+    require,
+)
 from .output import format_table, join_lines, name_options, show_activity
 from .outside_robot import ConnectedRobot, check_served, check_world, connect_robot, is_live
 from .pages import (
@@ -264,6 +271,8 @@ def _prepare(
     goal.resolve(states, "--to")
     for name in (*start.values, *goal.values):
         model.symbol(name)  # raises for unknown names, with similar ones
+    for option, request in (("--from", start), ("--to", goal)):
+        check_assigned_units(model, request.assignments, option)
     move: Any = arguments.move
     if not move:
         targets = [*goal.targets, *start.targets]

@@ -17,7 +17,7 @@ from kineverse.model.model_view import ModelView
 from kineverse.planning.manifold import hold_frames
 from kineverse.planning.planning_space import free_coordinates
 
-from .arguments import parse_assignments, parse_value
+from .arguments import parse_assignments, parse_pose_numbers, parse_value
 
 _ALL = "xyz rx ry rz"
 
@@ -44,6 +44,7 @@ class Request:
     values: dict[str, float] = field(default_factory=dict)  # values of coordinates by name [m], [rad]
     targets: list[FrameTarget] = field(default_factory=list)  # poses of frames
     names: list[str] = field(default_factory=list)  # other words, which name states of the SRDF
+    assignments: list[str] = field(default_factory=list)  # texts of the values, for their units
 
     def resolve(self, states: Mapping[str, Mapping[str, float]], option: str) -> None:
         """Replace names by the values of these states; values that are given win."""
@@ -59,17 +60,17 @@ class Request:
 
 def parse_request(words: Iterable[str], option: str, read_files: bool = False) -> Request:
     """Return what the words of an option ask for."""
-    found, assignments = Request(), []
+    found = Request()
     for word in words:
         if "=" in word:
-            assignments.append(word)
+            found.assignments.append(word)
         elif "@" in word:
             found.targets.append(parse_frame_target(word, option))
         elif read_files and word.endswith(".json"):
             found.values |= _read_values(word)
         else:
             found.names.append(word)
-    found.values |= parse_assignments(assignments, option)
+    found.values |= parse_assignments(found.assignments, option)
     return found
 
 
@@ -88,7 +89,7 @@ def parse_frame_target(word: str, option: str) -> FrameTarget:
             "follow X,Y,Z."
         )
     position_only = len(parts) == 3 and not plus
-    numbers = tuple(parse_value(part) for part in parts)
+    numbers = parse_pose_numbers(parts)
     return FrameTarget(frame, target, numbers, mask or ("xyz" if position_only else _ALL))
 
 

@@ -12,15 +12,17 @@ import kineverse as kv
 from kineverse.control import Goal, InverseKinematics, same_pose, same_position
 from kineverse.errors import InvalidValueError
 from kineverse.expressions.printing import format_number
+from kineverse.model.kinematics import infer_units
 
 from .arguments import (
     add_model_options,
+    check_assigned_units,
     find_turn_notes,
     load_model,
     match_coordinates,
     needs_mujoco,
     parse_assignments,
-    parse_value,
+    parse_pose_numbers,
     print_notes,
     require,
 )
@@ -99,6 +101,7 @@ def run(arguments: argparse.Namespace) -> int:
     from kineverse.view import save_picture  # for start-up time
 
     model = load_model(arguments, arguments.model)
+    check_assigned_units(model, arguments.assignments, "--from")
     standing: dict[kv.Symbol, float] = {}
     if arguments.robot is not None:
         _, standing = include_robot(arguments, model)
@@ -129,8 +132,9 @@ def run(arguments: argparse.Namespace) -> int:
         verdict = "reached" if result.solved else f"not reached. {name_options(result.why, arguments)}"
         print(f"{arguments.frame}: {verdict}")
         width = max(map(len, positions))
+        units = infer_units(model, {str(s): result.best[s] for s in model.symbols}, positions)
         for name, value in positions.items():
-            print(f"  {name:<{width}}  {format_number(value, 6)}")
+            print(f"  {name:<{width}}  {format_number(value, 6)} {units[name]}".rstrip())
         if arguments.picture is not None:
             print(f"picture: {arguments.picture}")
     return REACHED if result.solved else NOT_REACHED
@@ -145,7 +149,7 @@ def parse_pose(words: list[str]) -> list[float] | None:
             f"--pose takes 3 numbers for a position, 6 with roll, pitch and yaw, or the name of a frame, "
             f"and not {len(words)} words."
         )
-    return [parse_value(word) for word in words]
+    return [*parse_pose_numbers(words)]
 
 
 def make_goal(

@@ -146,7 +146,7 @@ def _choose_name(arguments: argparse.Namespace) -> str | None:
 
 
 def list_addresses(endpoints: Sequence[str], name: str, keys: str | None) -> list[str]:
-    """Return addresses for clients; a host of the certificate stands for all addresses of this computer."""
+    """Return addresses for clients, with a host of the certificate, as they refuse any other."""
     hosts: Sequence[str] = ()
     if keys is not None:
         from kineverse.exchange.keys import Keys  # for those who have no need of the package cryptography
@@ -157,7 +157,7 @@ def list_addresses(endpoints: Sequence[str], name: str, keys: str | None) -> lis
         kind = endpoint.partition("/")[0]
         if kind != "unixsock-stream" and hosts:
             host, port = split_endpoint(endpoint)
-            if host in ("0.0.0.0", "::"):
+            if host in ("0.0.0.0", "::") or (kind == "tls" and host not in hosts):
                 endpoint = f"{kind}/{f'[{hosts[0]}]' if ':' in hosts[0] else hosts[0]}:{port}"
         result.append(str(Address(name, endpoint)))
     return result

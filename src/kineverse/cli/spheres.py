@@ -10,7 +10,8 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from kineverse.errors import InvalidValueError, KineverseError, UnknownNameError, suggest
+from kineverse._names import match_names
+from kineverse.errors import InvalidValueError, KineverseError, UnknownNameError
 from kineverse.expressions.printing import format_number
 from kineverse.geometry.objects import CollisionObjects
 from kineverse.geometry.shapes import import_coal
@@ -28,6 +29,7 @@ from .arguments import (
     add_cache_options,
     add_model_options,
     add_set_option,
+    check_assigned_units,
     load_model,
     manage_cache,
     needs_mujoco,
@@ -79,7 +81,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.usage = "%(prog)s [MODEL] [options]"
     parser.add_argument("model", metavar="MODEL", nargs="?", help="name or path of a model; it comes first")
     add_model_options(parser)
-    parser.add_argument("--links", metavar="LINK", nargs="+", help="only the shapes of these links")
+    parser.add_argument(
+        "--links", metavar="LINK", nargs="+", help="only the shapes of these links (or patterns)"
+    )
     parser.add_argument("--protrusion", metavar="M", help="how far spheres may stick out: 0.005, 5mm")
     parser.add_argument("--most", metavar="N", type=int, help="largest number of spheres of a link (48)")
     parser.add_argument("--decomposed", action="store_true", help="cover the hulls of kineverse decompose")
@@ -107,6 +111,7 @@ def run(arguments: argparse.Namespace) -> int:
         model = load_model(arguments, arguments.model)
     for name in state:
         model.symbol(name)  # raises for unknown names, with similar ones
+    check_assigned_units(model, arguments.assignments, "--set")
     links = [LinkCover(body, items) for body, items in _objects(model, arguments).items()]
     for link in show_progress(links, "covering", "link"):
         _cover(link, protrusion, most, arguments.force)
@@ -131,14 +136,9 @@ def _objects(model: kv.Model, arguments: argparse.Namespace) -> dict[str, Sequen
     source.synchronize(model)
     if not source.by_body:
         raise InvalidValueError(f"{arguments.model} has no shapes that spheres could cover.")
-    for link in arguments.links or ():
-        if link not in source.by_body:
-            raise UnknownNameError(f"No link {link!r} has shapes. {suggest(link, source.by_body, 'link')}")
-    return {
-        body: items
-        for body, items in source.by_body.items()
-        if items and (not arguments.links or body in arguments.links)
-    }
+    with_shapes = {body: items for body, items in source.by_body.items() if items}
+    wanted = match_names(arguments.links or "*", with_shapes, "link with shapes", "--links")
+    return {body: items for body, items in with_shapes.items() if body in wanted}
 
 
 def _cover(link: LinkCover, protrusion: float | None, most: int, force: bool) -> None:

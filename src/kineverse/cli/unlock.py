@@ -12,7 +12,13 @@ from typing import TYPE_CHECKING
 from kineverse.errors import InvalidValueError, KineverseError
 from kineverse.reasoning import plan_unlocking
 
-from .arguments import add_model_options, load_model, match_coordinates, parse_assignments
+from .arguments import (
+    add_model_options,
+    check_assigned_units,
+    load_model,
+    match_coordinates,
+    parse_assignments,
+)
 
 if TYPE_CHECKING:
     from kineverse.model.model import Model
@@ -92,6 +98,8 @@ def run(arguments: argparse.Namespace) -> int:
         raise InvalidValueError("--jam and --record need --execute.")
 
     model = load_model(arguments, arguments.model)
+    for option, texts in (("--goal", arguments.goal), ("--from", arguments.assignments)):
+        check_assigned_units(model, texts, option)
     still = match_coordinates(model, arguments.still, "--still")
     plan = plan_unlocking(model, goal, start, fixed=still, budget=arguments.budget)
     if arguments.execute:

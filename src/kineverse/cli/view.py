@@ -14,6 +14,14 @@ from kineverse.geometry.exclusions import find_unusable_shapes, label_unusable_s
 from kineverse.model.registry import find_scheme
 from kineverse.planning import Trajectory
 from kineverse.view import meshes, save_picture
+from kineverse.view.clips import (
+    ClipMoment,
+    clip_times,
+    draw_clip,
+    is_clip_name,
+    sweep_ranges,
+    write_clip,
+)
 from kineverse.view.poses import complete
 from kineverse.worlds import RunRecording, read_run_recording
 
@@ -49,8 +57,9 @@ _NICENESS = 10  # of the page of a live system
 
 HELP = """\
 The page is served to this computer only, until Ctrl-C; with --host also to others, who need the address with
-its token. With --picture, a picture of the state is written instead. This needs no browser, and no extra
-except for meshes and --near.
+its token. With --picture, a picture of the state is written instead (.png). This needs no browser, and no extra
+except for meshes and --near. As .webp or .gif it is a clip: of a recording, of a trajectory, or
+of all joints that move through their ranges, except those that --set names. Clips need the extra 'view'.
 
 A recording of a run (.mcap) is played with a slider for its time: the truth, as a ghost what the robot
 believes, and as arrows what its controller wants. With --play, MODEL moves along a saved trajectory.
@@ -67,6 +76,7 @@ examples:
   kineverse view examples/arm.urdf --play arm.json   a trajectory of kineverse plan --save arm.json
   kineverse view run.mcap                            a recording, with a slider for its time
   kineverse view run.mcap --time 3.5 --picture run.png
+  kineverse view run.mcap --speed 4 --picture run.webp
   kineverse view run.mcap --plot run.svg             speeds, coordinates and contacts over time"""
 
 
@@ -90,7 +100,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--decomposed", action="store_true", help="for both, use the hulls of kineverse decompose"
     )
     parser.add_argument("--degrees", action="store_true", help="show angles in degrees")
-    parser.add_argument("--picture", metavar="PATH", help="write a picture (.png) instead of opening a page")
+    parser.add_argument(
+        "--picture",
+        metavar="PATH",
+        help="write a picture (.png) or a clip (.webp, .gif) instead of opening a page",
+    )
     playback = parser.add_argument_group("recordings and trajectories")
     playback.add_argument("--play", metavar="FILE", help="play a trajectory of kineverse plan --save")
     playback.add_argument(
@@ -118,10 +132,11 @@ def run(arguments: argparse.Namespace) -> int:
         "geometry": near is not None or arguments.decomposed,
         "figures": arguments.plot is not None,
         "mjcf": needs_mujoco(arguments.model),
-        "view": arguments.picture is None and arguments.plot is None,
+        "view": arguments.plot is None and (arguments.picture is None or is_clip_name(arguments.picture)),
     }
     require("kineverse view", extras)
-    check_picture_path(arguments.picture)
+    check_picture_path(arguments.picture, clips=True)
+    _check_clip(arguments)
     from kineverse.view.page import read_title  # for start-up time
 
     label = read_title(arguments.model)
@@ -145,6 +160,8 @@ def run(arguments: argparse.Namespace) -> int:
     for mesh in show_progress(meshes.list_visual_meshes(model), "reading meshes", "file"):
         meshes.load_mesh(mesh)  # cached for the drawing
     if arguments.picture is not None:
+        if is_clip_name(arguments.picture):
+            return _write_clip(arguments, model, assigned, motion)
         return _write_picture(arguments, model, assigned, near, motion)
     from kineverse.view.viewer import Viewer  # for start-up time
 
@@ -228,6 +245,52 @@ def _write_plot(arguments: argparse.Namespace, recording: RunRecording | None) -
     Figure(lambda canvas: plot_recording(recording, canvas), (11.0, 7.0)).save(Path(arguments.plot))
     print(f"plot: {arguments.plot}")
     return 0
+
+
+def _check_clip(arguments: argparse.Namespace) -> None:
+    """Raise if a clip is wanted of what only a picture shows."""
+    if arguments.picture is None or not is_clip_name(arguments.picture):
+        return
+    for option in ("near", "time"):
+        if getattr(arguments, option) is not None:
+            raise InvalidValueError(f"--{option} is for a picture of one moment (.png), and a clip is none.")
+
+
+def _write_clip(
+    arguments: argparse.Namespace,
+    model: ModelView,
+    state: dict[str, float],
+    motion: RunRecording | Trajectory | None,
+) -> int:
+    if motion is None:
+        moments = sweep_ranges(model, state, held=state)
+        if not moments:
+            raise InvalidValueError("Nothing moves that --set does not hold; a picture (.png) shows as much.")
+    else:
+        moments = _list_moments(motion, state, clip_times(motion.duration, arguments.speed))
+    drawn = draw_clip(model, moments, collisions=arguments.collisions, decomposed=arguments.decomposed)
+    pictures = [one for one, _ in zip(drawn, show_progress(moments, "drawing", "picture"), strict=True)]
+    write_clip(arguments.picture, pictures)
+    print_mesh_problems(list_mesh_problems(model))
+    print(f"clip: {arguments.picture}")
+    return 0
+
+
+def _list_moments(
+    motion: RunRecording | Trajectory, state: dict[str, float], times: list[float]
+) -> list[ClipMoment]:
+    """Return what a clip shows of a recording or of a trajectory at some times [s]."""
+    if isinstance(motion, Trajectory):
+        return [ClipMoment(state | {str(s): v for s, v in motion.at(time).items()}) for time in times]
+    from kineverse.view.run_overlay import RecordedScene  # for start-up time
+
+    scene = RecordedScene(motion)
+    moments = []
+    for time in times:
+        shown = scene.at(time)
+        ghosts, arrows = scene.drawing.draw_ghosts(shown), scene.drawing.draw_arrows(shown)
+        moments.append(ClipMoment(scene.values_at(time), ghosts, arrows))
+    return moments
 
 
 def _write_picture(

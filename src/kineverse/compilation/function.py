@@ -16,6 +16,8 @@ import casadi as ca
 import numpy as np
 import numpy.typing as npt
 
+from kineverse._names import answer_foreign_names
+from kineverse._synonyms import FUNCTION_SYNONYMS
 from kineverse.errors import CompileError, InvalidValueError
 from kineverse.expressions import Expression, ExpressionLike, array
 from kineverse.expressions.expression import NO_NODES, from_casadi
@@ -127,6 +129,8 @@ def compile(  # noqa: A001
     return CompiledFunction(expressions, inputs, single=single, tier=tier, wait=wait)
 
 
+@answer_foreign_names("A compiled function", FUNCTION_SYNONYMS)
+@answer_foreign_names("A compiled function", FUNCTION_SYNONYMS)
 class CompiledFunction(Generic[Results]):
     """A function of a vector of numbers, created by :func:`compile`.
 
@@ -256,13 +260,13 @@ class CompiledFunction(Generic[Results]):
         x
             A point per row, shape (N, n).
         out
-            Arrays for the results: contiguous, float64, of shape (N, *shape), one per output (alone if there
-            is a single output). New ones if None.
+            Arrays for the results: contiguous, float64, of shape ``(N, *shape)``, one per output (alone if
+            there is a single output). New ones if None.
 
         Returns
         -------
         numpy.ndarray or tuple of numpy.ndarray
-            An array of shape (N, *shape) per output; for a function of a single expression that array alone.
+            An array of shape ``(N, *shape)`` per output; for a function of one expression that array alone.
 
         Raises
         ------
@@ -411,6 +415,13 @@ class CompiledFunction(Generic[Results]):
         inputs = ", ".join(self.names[:4]) + (", ..." if len(self.names) > 4 else "")
         outputs = ", ".join(map(str, self.shapes[:6])) + (", ..." if len(self.shapes) > 6 else "")
         return f"CompiledFunction({len(self.names)} inputs: {inputs} -> {outputs}; {self.tier})"
+
+    def _repr_html_(self) -> str:
+        from kineverse._rich_display import html_table  # for start-up time
+
+        rows = [("input", str(i), name) for i, name in enumerate(self.names)]
+        rows += [("output", str(i), f"shape {shape}") for i, shape in enumerate(self.shapes)]
+        return html_table(f"compiled function, evaluated by {self.tier}", ("", "number", ""), rows)
 
 
 @dataclass(frozen=True, slots=True)

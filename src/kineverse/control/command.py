@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from kineverse._names import answer_foreign_names
+from kineverse._synonyms import COMMAND_SYNONYMS
 from kineverse.lie import Array
 from kineverse.symbols import Symbol
 
@@ -47,6 +49,7 @@ class TaskErrors(NamedTuple):
         return dict(zip(self.names, values.tolist(), strict=True))
 
 
+@answer_foreign_names("A command", COMMAND_SYNONYMS)
 @dataclass(frozen=True, slots=True, eq=False)
 class Command:
     """Speeds for one time step, with the state of each task.

@@ -11,10 +11,8 @@ import numpy.typing as npt
 from kineverse.errors import UnknownNameError, suggest
 from kineverse.lie import Array
 from kineverse.model.constraint import Constraint
-from kineverse.model.model_view import ModelView
+from kineverse.model.model_view import ModelView, find_symbols
 from kineverse.symbols import Symbol
-
-from .formulation import find_symbols
 
 _QUATERNION = ("qx", "qy", "qz", "qw")
 _SAME = 1e-9
@@ -101,7 +99,7 @@ def find_coordinates(
     """
     result: set[Symbol] = set()
     known = {*model.symbols, *model.rates.dependent, *model.speeds}
-    for symbol in find_symbols(model, names, argument):
+    for symbol in find_symbols(model, names, f"{argument}="):
         if symbol not in known and symbol.position not in known:
             raise UnknownNameError(
                 f"{argument}=: the model has no '{symbol}'. {suggest(str(symbol), map(str, known), 'symbol')}"

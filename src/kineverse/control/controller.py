@@ -11,7 +11,9 @@ import numpy as np
 import numpy.typing as npt
 
 from kineverse._checks import as_count
+from kineverse._names import answer_foreign_names
 from kineverse._runtime import CallLock, no_collection, one_at_a_time
+from kineverse._synonyms import CONTROLLER_SYNONYMS
 from kineverse.compilation import CompiledFunction
 from kineverse.compilation.function import WantedTier
 from kineverse.errors import InvalidValueError, ShapeError, UnknownNameError, suggest
@@ -43,6 +45,7 @@ _FEASIBLE = 1e-6
 """Largest violation of a row, in its unit per second, that counts as none where the solver failed."""
 
 
+@answer_foreign_names("A controller", CONTROLLER_SYNONYMS)
 class Controller:
     """Velocity controller that serves tasks within the constraints of a model.
 

@@ -8,7 +8,7 @@ closures of loops, are holds.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -19,7 +19,7 @@ from kineverse.expressions.expression import Expression, ExpressionLike, array, 
 from kineverse.expressions.functions import minimum, norm
 from kineverse.expressions.gradient import stack_columns
 from kineverse.model.constraint import Constraint
-from kineverse.model.model_view import ModelView
+from kineverse.model.model_view import ModelView, find_symbols
 from kineverse.model.projection import is_equality
 from kineverse.model.velocity_constraints.speed_limits import is_infinite, raw_max
 from kineverse.model.velocity_constraints.velocity_rows import VelocityRows, velocity_rows
@@ -265,7 +265,7 @@ def find_speeds(model: ModelView, names: Iterable[Symbol | str], argument: str) 
     coordinates.
     """
     result: set[Symbol] = set()
-    for symbol in find_symbols(model, names, argument):
+    for symbol in find_symbols(model, names, f"{argument}="):
         row = model.rates.row(symbol.position) if symbol.order <= 1 else None
         speeds = {symbol.derivative() if symbol.order == 0 else symbol} if row is None else set(row)
         unknown = [s for s in speeds if s not in model.speeds]
@@ -276,19 +276,6 @@ def find_speeds(model: ModelView, names: Iterable[Symbol | str], argument: str) 
             )
         result |= speeds
     return frozenset(result)
-
-
-def find_symbols(model: ModelView, names: Iterable[Symbol | str], argument: str) -> Iterator[Symbol]:
-    """Yield the symbols of names; an articulation stands for its coordinates."""
-    coordinates = set(map(str, model.symbols))
-    for item in (names,) if isinstance(names, str | Symbol) else names:
-        if isinstance(item, str) and item in model.articulations and item not in coordinates:
-            yield from model.articulations[item].coordinates
-            continue
-        symbol = model.symbol(item) if isinstance(item, str) else item
-        if not isinstance(symbol, Symbol):
-            raise ExpressionError(f"{argument}= takes symbols or their names, not {item!r}.")
-        yield symbol
 
 
 def check_tasks(tasks: Iterable[Task]) -> tuple[Task, ...]:

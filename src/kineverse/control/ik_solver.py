@@ -18,6 +18,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from kineverse._checks import as_count, as_tolerance
+from kineverse._names import answer_foreign_names
+from kineverse._synonyms import IK_RESULT_SYNONYMS, IK_SYNONYMS
 from kineverse.errors import NotFiniteError
 from kineverse.lie import Array
 from kineverse.model.constraint import TOLERANCE
@@ -39,6 +41,7 @@ _DIFFERENT = 1e-3  # least difference of a coordinate of two solutions [m], [rad
 _EXPLAINING_STARTS = 8
 
 
+@answer_foreign_names("A solver", IK_SYNONYMS)
 class InverseKinematics:
     """Solver of inverse kinematics for the tasks of a model, built once for many targets.
 
@@ -385,6 +388,7 @@ def inverse_kinematics(
     return solver.solve(values, starts=starts, solutions=solutions, seed=seed)
 
 
+@answer_foreign_names("A result", IK_RESULT_SYNONYMS)
 @dataclass(frozen=True, eq=False)
 class IkResult:
     """Configuration found by inverse kinematics, with the state of each task.

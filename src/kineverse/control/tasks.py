@@ -209,6 +209,7 @@ class Keep:
 
 
 Task: TypeAlias = Goal | Hold | Keep
+"""A task of a controller or of inverse kinematics."""
 
 
 def _describe(name: str, expression: object) -> str:
@@ -373,7 +374,7 @@ def same_position(a_T: ExpressionLike, b_T: ExpressionLike) -> Expression:
 
 
 def same_orientation(a_T: ExpressionLike, b_T: ExpressionLike) -> Expression:
-    """Return the rotation vector of b in a, shape (3,) [rad]; see :func:`.log_so3`.
+    """Return the rotation vector of b in a, shape (3,) [rad]; see :func:`kineverse.spatial.log_so3`.
 
     Examples
     --------

@@ -73,7 +73,7 @@ _ROTATION_VOLUME = 8 * math.pi**2  # volume of SO(3) in rotation vectors [rad³]
 class Outliers:
     """Outlier model: a mixture of the noise density and a uniform density.
 
-    A measurement with the noise density N is an inlier with the probability
+    A measurement with the noise density N is an inlier with the probability::
 
         w = (1 - ε) N / ((1 - ε) N + ε u)
 
@@ -145,7 +145,7 @@ class Outliers:
         square
             Squared norm of its whitened residual.
         log_scale
-            ½ log |2πR|.
+            ½ log det(2πR).
         log_density
             Result of :meth:`log_density`.
 

@@ -19,6 +19,7 @@ from typing import Any, TypeVar
 from msgspec.structs import replace
 
 from kineverse._checks import as_count, as_entries, as_tolerance, check_flag
+from kineverse._rich_display import Html, element, join_html
 from kineverse._runtime import Closing
 from kineverse._version import __version__
 from kineverse.errors import ConflictError, EditError, ForbiddenError, OfflineError
@@ -71,12 +72,18 @@ def load_live(
         __version__,
         "",
         "",
-        as_entries("frames=", frames or (), str, "names of frames") if is_part else EVERY_FRAME,
+        _parse_frames(frames) if is_part else EVERY_FRAME,
         tuple(map(str, as_entries("symbols=", symbols or (), (Symbol, str), "symbols, or their names"))),
         bodies,
         is_part or not bodies,
     )
     return LiveModel(Connection(Address.parse(source)), wish)
+
+
+def _parse_frames(frames: Iterable[str] | None) -> tuple[str, ...]:
+    """Return frames for a wish, in which ``kitchen/`` stands for ``kitchen/*``."""
+    names = as_entries("frames=", frames or (), str, "names of frames")
+    return tuple(name[:-1] if name == "*" or name.endswith("/*") else name for name in names)
 
 
 def include_live(edit: Edit, source: str, prefix: str | None = None) -> list[str]:
@@ -289,6 +296,12 @@ class LiveModel(Model, Closing):
         if connection.revision < wanted:
             connection.check_open()
         return is_over
+
+    def _repr_html_(self) -> str:
+        connection = self.exchange
+        state = "closed" if connection.is_closed else "online" if connection.is_online else "server away"
+        own = element("p", element("b", str(connection.address)), f": revision {self.version}, {state}")
+        return join_html(own, Html(super()._repr_html_()))
 
     def close(self) -> None:
         """End the connection; reading goes on. A second call has no effect, and a script need not call it."""

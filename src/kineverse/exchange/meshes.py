@@ -6,25 +6,28 @@ A client asks for a file when its triangles are needed, and keeps it on disk.
 from __future__ import annotations
 
 import hashlib
+import logging
 import os
 from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 from itertools import count
-from pathlib import Path
 
 from msgspec.structs import replace
 
-from kineverse.compilation.cache import private_subfolder
+from kineverse.compilation.cache_kinds import KINDS
 from kineverse.errors import FormatError
-from kineverse.formats.files import replace_file
 from kineverse.formats.resource_paths import locate_mesh
-from kineverse.formats.resources import FolderResolver, map_meshes, measure_content, meshes_of
+from kineverse.formats.resources import map_meshes, measure_content, meshes_of
 from kineverse.model.body import Mesh
 from kineverse.model.history import HistoryEntry
 from kineverse.model.operation import BODIES
 
 from .protocol import MeshContent
 from .store import Store
+
+_MESHES = KINDS["meshes"].make_cache(
+    logging.getLogger("kineverse.exchange"), "The mesh file %s %s and is fetched again."
+)
 
 MAX_PART = 1 << 20  # largest part of a file in one message [byte]
 
@@ -83,10 +86,11 @@ class FetchedFiles:
 
     def fetch(self, sha256: str, size: int) -> bytes | None:
         """Return the content with this SHA-256 and size [byte]; None if the server does not have it."""
-        folder = private_subfolder("files").path
-        content = FolderResolver(folder).fetch(sha256, size)
-        if content is not None and hashlib.sha256(content).hexdigest() == sha256:
-            return content
+        kept = _MESHES.open(sha256)
+        if kept is not None:
+            os.close(kept[0])
+            if hashlib.sha256(kept[1]).hexdigest() == sha256:
+                return kept[1]
         parts = bytearray()
         while len(parts) < size or not parts:
             part = self._fetch_part(sha256, len(parts))
@@ -98,7 +102,7 @@ class FetchedFiles:
         content = bytes(parts)
         if hashlib.sha256(content).hexdigest() != sha256:
             raise FormatError(f"the server sent another file than that with SHA-256 {sha256}")
-        replace_file(Path(folder, sha256), content)
+        _MESHES.write(sha256, content)
         return content
 
 

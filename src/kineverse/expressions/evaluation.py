@@ -6,8 +6,8 @@ For single evaluations; for many, see :mod:`kineverse.compile`.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
 import casadi as ca
 import numpy as np
@@ -26,6 +26,9 @@ from kineverse.errors import (
 from .expression import Expression
 from .graph import dense_column
 
+if TYPE_CHECKING:
+    from kineverse.symbols import Symbol
+
 
 def evaluate(
     expression: Expression, values: Mapping[Any, Any], by_name: Mapping[str, Any] | None = None
@@ -34,18 +37,45 @@ def evaluate(
     symbols = expression.symbols
     if by_name and isinstance(values, Mapping):
         values = {**values, **by_name}
-    vector = symbol_values(symbols, values, derived=True)
+    return _compute([expression], symbols, symbol_values(symbols, values, derived=True))[0]
+
+
+def evaluate_mapping(
+    entries: Mapping[Symbol, Expression],
+    about: tuple[Symbol, ...],
+    values: Mapping[Any, Any],
+    by_name: Mapping[str, Any],
+) -> dict[str, Any]:
+    """Return the numbers of some entries by the names of their keys, see :meth:`Gradient.__call__`.
+
+    Values of symbols that the entries are ``about`` are allowed if none of the entries contains them.
+    """
+    from kineverse.state import State
+
+    symbols = tuple(dict.fromkeys(s for entry in entries.values() for s in entry.symbols))
+    if isinstance(values, Mapping) and not isinstance(values, State):
+        values = {**values, **by_name}
+        silent = {*map(str, about)}.difference(map(str, symbols))
+        values = {key: value for key, value in values.items() if str(key) not in silent}
+    numbers = _compute([*entries.values()], symbols, symbol_values(symbols, values, derived=True))
+    return {str(key): n if n.shape else float(n) for key, n in zip(entries, numbers, strict=True)}
+
+
+def _compute(
+    expressions: Sequence[Expression], symbols: tuple[Any, ...], vector: npt.NDArray[np.float64]
+) -> list[npt.NDArray[Any]]:
     # Finding common subexpressions takes longer than computing them twice in one evaluation.
-    column = dense_column(expression)
+    columns = [dense_column(e) for e in expressions]
     inputs = ca.vertcat(*(s._sx for s in symbols)) if symbols else ca.SX(0, 1)
-    result = np.array(ca.Function("e", [inputs], [column])(vector)).reshape(expression.shape)
-    if np.isnan(result).any():
+    computed = ca.Function("e", [inputs], columns).call([vector])
+    results = [np.array(one).reshape(e.shape) for one, e in zip(computed, expressions, strict=True)]
+    if any(np.isnan(result).any() for result in results):
         from .implicit import explain_no_solution, implicit_nodes
 
-        error = explain_no_solution(implicit_nodes([expression]), symbols, vector)
+        error = explain_no_solution(implicit_nodes(expressions), symbols, vector)
         if error is not None:
             raise error
-    return result[()]
+    return [result[()] for result in results]
 
 
 def symbol_values(

@@ -28,9 +28,11 @@ if TYPE_CHECKING:
 
     from kineverse.symbols import Symbol
 
+    from .gradient import Gradient
     from .node import AccessListener, Node
 
 ExpressionLike: TypeAlias = "Expression | float | int | npt.ArrayLike | Sequence[Any]"
+"""Values that become an expression: numbers, arrays, expressions, and nested lists of these."""
 
 NO_NODES: frozenset[Node] = frozenset()
 
@@ -334,11 +336,12 @@ class Expression(ArrayMethods):
 
     # -- gradients -----------------------------------------------------------------------------------------
 
-    def gradient(self, heuristic: bool = True) -> Mapping[Symbol, Expression]:
+    def gradient(self, heuristic: bool = True) -> Gradient:
         """Return D(e): a mapping from derivative symbols to expressions of this shape.
 
         The augmented gradient of the papers (2022, Eqs. 5-8): where nothing was augmented, the entry of ``ȧ``
-        is ∂e/∂a. Entries that are structurally zero are left out.
+        is ∂e/∂a. Entries that are structurally zero are left out. The numbers of all entries,
+        by name, are ``e.gradient()({name: number})``.
 
         Parameters
         ----------
@@ -565,17 +568,10 @@ class Expression(ArrayMethods):
 
         return text(notify_access(self))
 
-    def _repr_latex_(self) -> str | None:
-        from .printing import latex
+    def _repr_latex_(self) -> str:
+        from .printing import expression_latex
 
-        formula = latex(notify_access(self))
-        return None if formula is None else f"$\\displaystyle {formula}$"
-
-    def _repr_html_(self) -> str | None:
-        from .printing import html
-
-        # A notebook prefers HTML to LaTeX, so there is none for expressions that are short enough for LaTeX.
-        return html(self) if self._repr_latex_() is None else None
+        return f"$\\displaystyle {expression_latex(notify_access(self))}$"
 
     # -- numpy ---------------------------------------------------------------------------------------------
 

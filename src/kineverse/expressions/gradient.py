@@ -30,13 +30,20 @@ if TYPE_CHECKING:
 class Gradient(Mapping["Symbol", Expression]):
     """D(e): an immutable mapping from derivative symbols to expressions, in the order of the symbols.
 
-    Keys are symbols or their names, such as ``door:velocity``.
+    Keys are symbols or their names, such as ``door:velocity``. Called with the values of symbols, it returns
+    the numbers of its entries by name.
     """
 
-    __slots__ = ("_entries",)
+    __slots__ = ("_about", "_entries", "_of")
 
-    def __init__(self, entries: Mapping[Symbol, Expression]) -> None:
-        self._entries = dict(entries)
+    def __init__(
+        self,
+        entries: Mapping[Symbol, Expression],
+        about: tuple[Symbol, ...] = (),
+        of: Expression | None = None,
+    ) -> None:
+        self._entries, self._about = dict(entries), about
+        self._of = of  # the expression, if some of the entries may be trends
 
     def __getitem__(self, key: Symbol | str) -> Expression:
         entry: Expression | None = self.get(key)
@@ -77,27 +84,54 @@ class Gradient(Mapping["Symbol", Expression]):
         """Return speeds and entries."""
         return self._entries.items()
 
+    def __call__(self, values: Mapping[Any, Any] | None = None, /, **by_name: float) -> dict[str, Any]:
+        """Return the numbers of all entries by the names of their speeds: floats, or arrays of their shape.
+
+        Parameters
+        ----------
+        values
+            Numbers of symbols, as for the expression itself, see :meth:`Expression.__call__`.
+
+        Raises
+        ------
+        UnknownNameError
+            For missing values, listed, and for names that the expression does not contain.
+        """
+        from .evaluation import evaluate_mapping
+
+        return evaluate_mapping(self._entries, self._about, {} if values is None else values, by_name)
+
+    @property
+    def trends(self) -> frozenset[Symbol]:
+        """Speeds whose entries are trends: directions of search, which the exact gradient does not have."""
+        if self._of is None:
+            return frozenset()
+        exact = gradient(self._of, heuristic=False)
+        return frozenset(speed for speed, entry in self._entries.items() if entry != exact.get(speed))
+
     def __reduce__(self) -> Any:
-        return Gradient, (self._entries,)
+        return Gradient, (self._entries, self._about, self._of)
 
     def __repr__(self) -> str:
         from .printing import mapping_text
 
         return mapping_text(self)
 
-    def _repr_html_(self) -> str:
-        from .printing import mapping_html
+    def _repr_latex_(self) -> str:
+        from .printing import gradient_latex
 
-        return mapping_html(self)
+        return f"$\\displaystyle {gradient_latex(self, self.trends)}$"
 
 
-def gradient(expression: Expression, heuristic: bool = True) -> Mapping[Symbol, Expression]:
+def gradient(expression: Expression, heuristic: bool = True) -> Gradient:
     """Return D(e), see :meth:`Expression.gradient`."""
     known = expression._gradients.get(heuristic)
     if known is None:
-        known = Gradient(_gradient(expression, heuristic))
+        may_have_trends = heuristic and bool(expression._nodes)
+        of = expression if may_have_trends else None
+        known = Gradient(_gradient(expression, heuristic), expression.symbols, of)
         expression._gradients[heuristic] = known
-    result: Mapping[Symbol, Expression] = known
+    result: Gradient = known
     return result
 
 

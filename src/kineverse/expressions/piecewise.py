@@ -43,7 +43,7 @@ def spline(
     everywhere. At ±infinity a spline has its limit, which is the last value, or ±infinity with a slope; a
     periodic spline has no limit and is NaN there.
 
-    Between the knots t_k and t_k+1, at a distance h and with s = x - t_k, it is
+    Between the knots t_k and t_k+1, at a distance h and with s = x - t_k, it is::
 
         y_k + m_k s + (3d - 2m_k - m_k+1) s²/h + (m_k + m_k+1 - 2d) s³/h²,      d = (y_k+1 - y_k)/h
 

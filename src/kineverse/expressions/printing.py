@@ -1,11 +1,15 @@
-"""Expressions as text, LaTeX and HTML of bounded length; HTML tables for notebooks."""
+r"""Expressions and gradients as text and LaTeX of bounded length, and numbers with few digits.
+
+In LaTeX, velocities are ``\dot{a}`` and arrays are matrices. It has only commands that TeX and MathJax, which
+notebooks use, know alike. Names are escaped: they come from files.
+"""
 
 from __future__ import annotations
 
-import itertools
 import math
-from collections.abc import Mapping, Sequence
-from html import escape
+import re
+from collections.abc import Mapping
+from itertools import islice
 from typing import TYPE_CHECKING
 
 import casadi as ca
@@ -20,9 +24,7 @@ if TYPE_CHECKING:
 _LIMIT = 400
 _ELEMENTS = 16
 _DEPTH = 24
-_LONGEST_FORMULA = 3000
 _LONGEST_MAPPING = 4 * _LIMIT
-_ROWS = 40
 
 _INFIX = {ca.OP_ADD: ("+", 1), ca.OP_SUB: ("-", 1), ca.OP_MUL: ("*", 2), ca.OP_DIV: ("/", 2)}
 _COMPARISONS = {
@@ -40,6 +42,29 @@ _FUNCTIONS = {
 }  # fmt: skip
 
 
+_LONGEST_FORMULA = 3000  # characters of LaTeX; notebooks take a second for ten times as many
+_EDGE = 6  # most rows and columns of a matrix that are shown; the size of a Jacobian of a pose
+_ENTRIES = 12  # most entries of a gradient that are shown
+
+_NAMED = {
+    "sin": r"\sin", "cos": r"\cos", "tan": r"\tan", "arcsin": r"\arcsin", "arccos": r"\arccos",
+    "arctan": r"\arctan", "sinh": r"\sinh", "cosh": r"\cosh", "tanh": r"\tanh", "exp": r"\exp",
+    "log": r"\ln", "minimum": r"\min", "maximum": r"\max",
+}  # fmt: skip
+_BRACKETS = {
+    "sqrt": (r"\sqrt{", "}"), "abs": (r"\left|", r"\right|"),
+    "floor": (r"\lfloor ", r"\rfloor "), "ceil": (r"\lceil ", r"\rceil "),
+}  # fmt: skip
+_SIGNS = {
+    "<": r"\lt ", "<=": r"\le ", "==": "=", "!=": r"\ne ", "and": r"\land ", "or": r"\lor ",
+    "less": r"\lt ",
+}  # fmt: skip
+_ESCAPED = {
+    **{c: f"\\{c}" for c in "_%&#{}$"}, "\\": r"\backslash ", "<": r"\lt ", ">": r"\gt ", "~": r"\sim ",
+    "^": r"\wedge ", " ": r"\ ", "'": r"\text{'}", '"': r"\text{''}", "`": r"\text{'}", "-": r"\text{-}",
+}  # fmt: skip
+
+
 def text(expression: Expression) -> str:
     """Return a bounded, readable form: the formula of a scalar, shape and first elements of an array."""
     writer = _Writer()
@@ -53,27 +78,30 @@ def text(expression: Expression) -> str:
     return f"Expression{expression.shape}[{body}]"
 
 
-def latex(expression: Expression) -> str | None:
-    r"""Return LaTeX: ``\dot{a}`` for velocities, matrices up to 6×6; None if it is too long to read."""
-    writer = _Latex()
-    if not expression.shape:
-        formula = writer.bounded(expression._sx)
-        return formula if len(formula) <= _LONGEST_FORMULA and formula != writer.ellipsis else None
-    rows, columns = expression._sx.shape
-    if expression.ndim > 2 or rows > 6 or columns > 6:
-        return None
-    lines = []
-    for i in range(rows):
-        entries = [writer.bounded(expression._sx[i, j]) for j in range(columns)]
-        lines.append(" & ".join(entries))
-        if sum(map(len, lines)) > _LONGEST_FORMULA or writer.ellipsis in entries:
-            return None
-    return r"\begin{bmatrix}" + r" \\ ".join(lines) + r"\end{bmatrix}"
+def expression_latex(expression: Expression) -> str:
+    r"""Return the formula of a scalar, or the matrix of an array, cut by ``\dots`` where it is too long."""
+    for limit in (_LONGEST_FORMULA, 400, 100, 25):
+        formula = _Latex(limit).array(expression)
+        if len(formula) <= _LONGEST_FORMULA:
+            return formula
+    return _Latex.ellipsis
 
 
-def html(expression: Expression) -> str:
-    """Return the text as HTML, for expressions that are too long for a formula."""
-    return f"<code>{escape(repr(expression))}</code>"
+def gradient_latex(gradient: Mapping[Symbol, Expression], trends: frozenset[Symbol] = frozenset()) -> str:
+    """Return the entries of a gradient, each said to be exact or, for some keys, a trend."""
+    if not gradient:
+        return r"\text{no entries}"
+    for limit in (_LONGEST_FORMULA // 4, 200, 50):
+        writer, lines = _Latex(limit), []
+        for speed, entry in islice(gradient.items(), _ENTRIES):
+            kind = "trend" if speed in trends else "exact"
+            lines.append(rf"{writer.symbol(speed)} & : & {writer.array(entry)} & \text{{{kind}}}")
+        if len(gradient) > _ENTRIES:
+            lines.append(rf"\dots & & {len(gradient) - _ENTRIES}\ \text{{more}} & ")
+        formula = r"\begin{array}{rcll}" + r" \\ ".join(lines) + r"\end{array}"
+        if len(formula) <= 2 * _LONGEST_FORMULA:
+            return formula
+    return _Latex.ellipsis
 
 
 def mapping_text(gradient: Mapping[Symbol, Expression]) -> str:
@@ -87,12 +115,6 @@ def mapping_text(gradient: Mapping[Symbol, Expression]) -> str:
             break
     more = len(gradient) - len(shown)
     return f"{{{', '.join(shown)}{f', ... {more} more' if more else ''}}}"
-
-
-def mapping_html(gradient: Mapping[Symbol, Expression]) -> str:
-    """Return a gradient as a table of HTML, its first entries if it has many."""
-    rows = [(str(key), repr(entry)) for key, entry in itertools.islice(gradient.items(), _ROWS)]
-    return html_table("D", ("speed", "entry"), rows, len(gradient))
 
 
 class _Writer:
@@ -119,7 +141,10 @@ class _Writer:
             return "0"
         if element.is_constant():
             written = self.number(float(element))
-            return self.grouped(written) if strength > 2 and written.startswith("-") else written
+            # A number of LaTeX may be a product with a power of ten.
+            return (
+                self.grouped(written) if strength > 2 and (written[0] == "-" or " " in written) else written
+            )
         if element.is_symbolic():
             return self.leaf(element, depth)
         operation = element.op()
@@ -141,7 +166,7 @@ class _Writer:
             return self.grouped(written) if strength > 2 else written
         if operation in _COMPARISONS:
             a, b = (self.write(o, depth + 1, 1) for o in operands)
-            return self.grouped(f"{a} {_COMPARISONS[operation]} {b}")
+            return self.compared(_COMPARISONS[operation], a, b)
         name = _FUNCTIONS.get(operation, f"op{operation}")
         return self.call(name, [self.write(o, depth + 1) for o in operands])
 
@@ -162,6 +187,9 @@ class _Writer:
 
     def number(self, value: float) -> str:
         return repr(int(value)) if abs(value) < 1e6 and value == int(value) else f"{value:.6g}"
+
+    def compared(self, sign: str, a: str, b: str) -> str:
+        return self.grouped(f"{a} {sign} {b}")
 
     def grouped(self, written: str) -> str:
         return f"({written})"
@@ -187,61 +215,91 @@ class _Writer:
 
 
 class _Latex(_Writer):
-    ellipsis = r"\dots"
-    limit = 4 * _LIMIT
+    """Writer of scalars as LaTeX."""
+
+    ellipsis = r"\dots "
+
+    def __init__(self, limit: int) -> None:
+        self.limit = limit
+
+    def array(self, expression: Expression) -> str:
+        """Return a matrix; of arrays with more axes the shape only."""
+        if not expression.shape:
+            return self.bounded(expression._sx)
+        if expression.ndim > 2:
+            shape = r" \times ".join(map(str, expression.shape))
+            return rf"{self.ellipsis}\ \left({shape}\right)"
+        rows, columns = expression._sx.shape
+        lines = []
+        for i in range(min(rows, _EDGE)):
+            entries = [self.bounded(expression._sx[i, j]) for j in range(min(columns, _EDGE))]
+            lines.append(" & ".join([*entries, *([r"\cdots "] if columns > _EDGE else [])]))
+        if rows > _EDGE:
+            lines.append(" & ".join([r"\vdots "] * (min(columns, _EDGE) + (columns > _EDGE))))
+        return r"\begin{bmatrix}" + r" \\ ".join(lines) + r"\end{bmatrix}"
+
+    def infix(self, operation: int, operands: list[SX], depth: int, strength: int) -> str:
+        if operation != ca.OP_DIV:
+            return super().infix(operation, operands, depth, strength)
+        above, below = (self.write(operand, depth + 1) for operand in operands)
+        written = rf"\frac{{{above}}}{{{below}}}"
+        return self.grouped(written) if strength > 2 else written
 
     def join(self, sign: str, a: str, b: str) -> str:
-        return {"*": f"{a} \\, {b}", "/": f"\\frac{{{a}}}{{{b}}}"}.get(sign, f"{a} {sign} {b}")
+        return f"{a} \\, {b}" if sign == "*" else f"{a} {sign} {b}"
 
     def power(self, operands: list[SX], depth: int) -> str:
         return f"{{{self.write(operands[0], depth + 1, 3)}}}^{{{self.write(operands[1], depth + 1)}}}"
 
+    def number(self, value: float) -> str:
+        if not math.isfinite(value):
+            return r"\text{NaN}" if math.isnan(value) else rf"{'-' if value < 0 else ''}\infty "
+        digits, _, exponent = super().number(value).partition("e")
+        if not exponent:
+            return digits
+        power = f"10^{{{int(exponent)}}}"
+        return power if digits == "1" else rf"{digits} \cdot {power}"
+
     def grouped(self, written: str) -> str:
-        return rf"\left({written}\right)"
+        return written if _is_grouped(written) else rf"\left({written}\right)"
+
+    def compared(self, sign: str, a: str, b: str) -> str:
+        return self.grouped(f"{a} {_SIGNS[sign]}{b}")
 
     def call(self, name: str, arguments: list[str]) -> str:
-        return rf"\operatorname{{{name}}}\left({', '.join(arguments)}\right)"
+        if name in _BRACKETS and len(arguments) == 1:
+            return arguments[0].join(_BRACKETS[name])
+        if name in ("less", "and", "or") and len(arguments) > 1:
+            return self.grouped(f" {_SIGNS[name]}".join(arguments))
+        if name == "not":
+            return rf"\lnot {self.grouped(arguments[0])}"
+        if name == "if_else_zero":
+            return rf"\left[{arguments[0]}\right] \, {self.grouped(arguments[1])}"  # Iverson's bracket
+        written = _NAMED.get(name) or rf"\operatorname{{{_escape(name)}}}"
+        return rf"{written}\left({', '.join(arguments)}\right)"
 
     def symbol(self, symbol: Symbol) -> str:
-        name = _escape_latex(symbol.path)
+        path = symbol.path
+        name = path if len(path) == 1 and path.isalpha() else rf"\mathrm{{{_escape(path)}}}"
         if symbol.order == 0:
             return name
-        if symbol.order <= 4:
+        if symbol.order <= 2:
             return rf"\{'d' * symbol.order}ot{{{name}}}"
-        return rf"{name}^{{({symbol.order})}}"
+        return rf"{{{name}}}^{{({symbol.order})}}"
 
 
-def _escape_latex(path: str) -> str:
-    if len(path) == 1:
-        return path
-    table = {c: f"\\{c}" for c in "_%&#{}"} | {"\\": r"\backslash "}
-    return r"\mathrm{" + "".join(table.get(c, c) for c in path) + "}"
+def _is_grouped(written: str) -> bool:
+    """Return whether the first parenthesis closes at the end."""
+    depth = 0
+    for part in re.split(r"(\\left|\\right)", written)[1:-2]:
+        depth += {r"\left": 1, r"\right": -1}.get(part, 0)
+        if not depth:
+            return False
+    return written.startswith(r"\left(") and written.endswith(r"\right)")
 
 
-_MOST_TABLE_ROWS = 50
-_LONGEST_CELL = 200
-
-
-def html_table(
-    caption: str, header: Sequence[str], rows: Sequence[Sequence[str]], total: int | None = None
-) -> str:
-    """Return an HTML table of texts, which are escaped; long texts and many rows are cut."""
-    head = "".join(f"<th>{escape(title)}</th>" for title in header)
-    body = "".join(
-        f"<tr>{''.join(f'<td>{escape(_shorten_cell(cell))}</td>' for cell in row)}</tr>"
-        for row in rows[:_MOST_TABLE_ROWS]
-    )
-    more = (len(rows) if total is None else total) - min(len(rows), _MOST_TABLE_ROWS)
-    if more:
-        body += f'<tr><td colspan="{len(header)}">... {more} more</td></tr>'
-    return (
-        f"<table><caption>{escape(caption)}</caption><thead><tr>{head}</tr></thead>"
-        f"<tbody>{body}</tbody></table>"
-    )
-
-
-def _shorten_cell(text: str) -> str:
-    return text if len(text) <= _LONGEST_CELL else f"{text[: _LONGEST_CELL - 1]}…"
+def _escape(name: str) -> str:
+    return "".join(_ESCAPED.get(c, c if c.isprintable() else r"\ ") for c in name)
 
 
 def format_number(value: float, digits: int = 4) -> str:

@@ -119,7 +119,8 @@ def load(
         Arguments of a ``.xacro`` template by name. They may also follow the path, ``"arm.xacro side:=left"``.
     frames, symbols, bodies
         Part of a live model: what the poses of these frames and the constraints and rates of these symbols
-        depend on, and whether with bodies. By default all of it.
+        depend on, and whether with bodies. ``kitchen/*`` stands for all frames with names that begin so. By
+        default all of it.
 
     Raises
     ------

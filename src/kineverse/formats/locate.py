@@ -132,7 +132,10 @@ def _no_member(group: str, collection: registry.ModelCollection, name: str) -> s
     shown = ", ".join(names) + (", …" if collection.accept else "")
     if not name:
         return f"'{group}' is many models, {collection.summary}: {shown}. Load one as '{group}/{names[0]}'."
-    found = [] if collection.accept else _alike(name, [])
+    from difflib import get_close_matches  # for start-up time
+
+    alike = [f"{group}/{one}" for one in get_close_matches(name, names, n=_LISTED, cutoff=0.7)]
+    found = alike if collection.accept else _alike(name, [])
     meant = f"Did you mean {' or '.join(map(repr, found))}?" if found else f"Available: {shown}."
     return f"There is no model {_shown(f'{group}/{name}')}. {meant}"
 

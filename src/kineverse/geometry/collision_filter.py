@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from kineverse._names import is_pattern, matches_pattern, no_match_error
 from kineverse.errors import InvalidValueError, UnknownNameError, suggest
 from kineverse.loops.loop_records import find_loops
 from kineverse.model.body import Pose
@@ -20,13 +21,11 @@ from kineverse.model.frame import WORLD, Frame
 from kineverse.model.model_view import ModelView
 
 from .broadphase import Flags
-from .objects import matches_pattern
 
 RULES = "geometry/rules"
 """Name of the data entry that holds a model's rules; an included model has its entry below its prefix."""
 
 _FREE_SPEEDS = 6
-_WILDCARDS = "*?["
 
 
 class Rule(NamedTuple):
@@ -108,8 +107,16 @@ def check_frame_names(what: str, names: Iterable[str], model: ModelView) -> None
     """Raise UnknownNameError for a name, no pattern, that no frame has; ``what`` begins the message."""
     frames = model.frames
     for name in dict.fromkeys(names):
-        if not any(sign in name for sign in _WILDCARDS) and name not in frames and name != WORLD:
+        if not is_pattern(name) and name not in frames and name != WORLD:
             raise UnknownNameError(f"{what} '{name}', which is not a frame. {suggest(name, frames, 'frame')}")
+
+
+def check_body_patterns(argument: str, patterns: Iterable[str], model: ModelView) -> None:
+    """Raise UnknownNameError for a pattern that no frame matches; ``*`` may stand for none."""
+    frames = [*model.frames, WORLD]
+    for pattern in {*patterns} - {"*"}:
+        if is_pattern(pattern) and not any(matches_pattern(frame, (pattern,)) for frame in frames):
+            raise no_match_error(pattern, frames, "body", argument)
 
 
 def allowed_pairs(model: ModelView, bodies: Sequence[str], rules: Sequence[Rule]) -> Flags:
@@ -134,8 +141,7 @@ def apply_rules(flags: Flags, bodies: Sequence[str], rules: Sequence[Rule]) -> F
 
 def _matching_bodies(name: str, index: Mapping[str, int], matches: dict[str, list[int]]) -> list[int]:
     if name not in matches:
-        is_pattern = any(sign in name for sign in _WILDCARDS)
-        candidates = index if is_pattern else (name,) if name in index else ()
+        candidates = index if is_pattern(name) else (name,) if name in index else ()
         matches[name] = [index[body] for body in candidates if matches_pattern(body, (name,))]
     return matches[name]
 

@@ -32,6 +32,7 @@ from .collision_filter import (
     Rule,
     allowed_pairs,
     apply_rules,
+    check_body_patterns,
     check_frame_names,
     parse_known_rules,
     read_rules,
@@ -63,8 +64,9 @@ class CollisionWorld:
         some, others = (as_entries(f"{what}=", entries, str, wanted) for what, entries in meshes)
         patterns = some, others, parse_exclusions(leave_out)
         for what, names in zip(("triangles", "decomposed", "leave_out"), patterns, strict=True):
-            bodies = (name if isinstance(name, str) else name[0] for name in names)
+            bodies = [name if isinstance(name, str) else name[0] for name in names]
             check_frame_names(f"{what}= names", bodies, model)
+            check_body_patterns(f"{what}=", bodies, model)
         self._source = CollisionObjects(*patterns)
         self._version: int | None = None
         self._placed_at: tuple[tuple[Symbol, ...], Floats] = (), np.zeros(0)  # symbols and values

@@ -10,6 +10,7 @@ from typing import TypeAlias
 import numpy as np
 import numpy.typing as npt
 
+from kineverse._names import match_names
 from kineverse._runtime import one_at_a_time
 from kineverse.errors import InvalidValueError, KineverseError, ShapeError, UnknownNameError, suggest
 from kineverse.model.frame import WORLD
@@ -23,7 +24,6 @@ from .broadphase import Flags, Indices, PairSelection
 from .collision_world import CollisionWorld
 from .mesh_files import Floats
 from .narrowphase import ACCURACY
-from .objects import matches_pattern
 from .results import DistanceResult, DistanceResults
 
 
@@ -416,15 +416,8 @@ def flag_between(ones: PairFlags, others: PairFlags) -> npt.NDArray[np.bool_]:
 
 def flag_matching(bodies: Sequence[str], patterns: str | Iterable[str]) -> npt.NDArray[np.bool_]:
     """Return (B,) flags of the bodies that match one of some names or patterns."""
-    result = np.zeros(len(bodies), dtype=bool)
-    for pattern in (patterns,) if isinstance(patterns, str) else tuple(patterns):
-        matching = np.array([matches_pattern(body, (pattern,)) for body in bodies], dtype=bool)
-        if not matching.any():
-            raise UnknownNameError(
-                f"No body of the scene is named or matched by '{pattern}'. {suggest(pattern, bodies, 'body')}"
-            )
-        result |= matching
-    return result
+    matching = {*match_names(patterns, bodies, "body of the scene")}
+    return np.array([body in matching for body in bodies], dtype=bool)
 
 
 def flag_subtree(model: ModelView, bodies: Sequence[str], frame: str) -> npt.NDArray[np.bool_]:

@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from importlib.util import find_spec
 
+from kineverse._names import matches_pattern
 from kineverse.errors import FormatError, InvalidValueError, MissingDependencyError, summarize_error
 from kineverse.model.basic_operations import Override, SetBody
 from kineverse.model.body import Body, Geometry, Mesh
@@ -14,7 +15,7 @@ from kineverse.model.model_view import ModelView
 
 from .broadphase import Flags
 from .collision_filter import Rule, adjacent_pairs, allowed_pairs, read_rules
-from .objects import collision_shapes, matches_pattern
+from .objects import collision_shapes
 from .shapes import solid_from_geometry
 
 RIGID = "rigidly connected"

@@ -5,9 +5,9 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from fnmatch import fnmatchcase
 from typing import Any, TypeAlias
 
+from kineverse._names import matches_pattern
 from kineverse.errors import FormatError, InvalidValueError, summarize_error
 from kineverse.expressions.expression import Expression
 from kineverse.model.body import Body, Mesh, Shape
@@ -77,11 +77,6 @@ def collision_shapes(body: Body) -> tuple[Shape, ...]:
 def bodies_with_visual_collision(model: ModelView) -> list[str]:
     """Return the bodies without collision shapes, which are represented by their visual shapes."""
     return [name for name, body in model.bodies.items() if body.visuals and not body.collisions]
-
-
-def matches_pattern(name: str, patterns: Iterable[str]) -> bool:
-    """Return True if a name equals or matches one of some patterns, in which ``*`` is any text."""
-    return any(name == pattern or fnmatchcase(name, pattern) for pattern in patterns)
 
 
 class CollisionObjects:

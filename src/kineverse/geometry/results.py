@@ -8,11 +8,15 @@ from typing import overload
 
 import numpy as np
 
+from kineverse._names import answer_foreign_names
+from kineverse._synonyms import DISTANCE_SYNONYMS
+
 from .broadphase import Indices
 from .collision_world import CollisionWorld
 from .mesh_files import Floats
 
 
+@answer_foreign_names("A distance", DISTANCE_SYNONYMS)
 @dataclass(frozen=True, slots=True, eq=False)
 class DistanceResult:
     """Signed distance of two bodies, with its witness points and normal.

@@ -9,7 +9,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from kineverse._names import answer_foreign_names
 from kineverse._runtime import one_at_a_time
+from kineverse._synonyms import SCENE_SYNONYMS
 from kineverse.errors import InvalidValueError, NoSolutionError
 from kineverse.model.frame_dependence import FrameDependence
 from kineverse.model.model_view import ModelView
@@ -38,6 +40,8 @@ from .results import DistanceResult, DistanceResults, NearestPoint, RayHit
 _MAX_QUERIES, _SAMPLES = 256, 200
 
 
+@answer_foreign_names("A scene", SCENE_SYNONYMS)
+@answer_foreign_names("A scene", SCENE_SYNONYMS)
 class Scene:
     """Collision scene: the bodies of a model at one state, with distance, ray and point queries.
 

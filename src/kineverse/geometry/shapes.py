@@ -7,7 +7,7 @@ import logging
 import math
 import threading
 from collections.abc import Sequence
-from functools import lru_cache, partial
+from functools import lru_cache
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -15,7 +15,7 @@ from msgspec import Struct, field
 from msgspec.structs import replace
 
 from kineverse._extras import install_command
-from kineverse.compilation.cache import ContentCache, private_subfolder
+from kineverse.compilation.cache_kinds import KINDS
 from kineverse.errors import FormatError, InvalidValueError, MissingDependencyError
 from kineverse.model.body import Box, Capsule, Cone, Cylinder, Ellipsoid, Geometry, Mesh, Sphere
 
@@ -27,12 +27,8 @@ SMALLEST_MESH, LARGEST_MESH = 1e-6, 1e6
 THICKNESS = 2e-5
 """Least thickness of a hull [m]; flat hulls are thickened to it, or to 1e-5 of their size if that is more."""
 
-_MESH_HULLS = ContentCache(
-    partial(private_subfolder, "mesh_hulls"),
-    ".corners",
-    64 * 2**20,
-    logging.getLogger("kineverse.geometry"),
-    "The hull of a mesh %s %s and counts as absent.",
+_MESH_HULLS = KINDS["mesh_hulls"].make_cache(
+    logging.getLogger("kineverse.geometry"), "The hull of a mesh %s %s and counts as absent."
 )
 _WHOLE_FILES = (".stl", ".obj", ".dae", ".ply", ".off")  # suffixes of files without further files
 _HULL_VERSION = 1  # raise the number when the hulls of equal meshes change

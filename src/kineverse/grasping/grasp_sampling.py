@@ -10,9 +10,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from kineverse import lie
+from kineverse._names import matches_pattern
 from kineverse.errors import InvalidValueError
 from kineverse.geometry import Scene
-from kineverse.geometry.objects import collision_shapes, matches_pattern
+from kineverse.geometry.objects import collision_shapes
 from kineverse.lie import Array
 from kineverse.model.body import Body
 from kineverse.model.frame import is_of_robot

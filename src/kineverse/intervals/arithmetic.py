@@ -14,6 +14,7 @@ from typing import TypeAlias
 import casadi as ca
 
 RealInterval: TypeAlias = tuple[float, float]
+"""A closed interval of the extended real numbers, (lower, upper)."""
 
 REALS: RealInterval = (-math.inf, math.inf)
 ZERO_INTERVAL: RealInterval = (0.0, 0.0)

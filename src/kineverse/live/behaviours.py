@@ -15,8 +15,8 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from kineverse._names import matches_pattern
 from kineverse.errors import KineverseError, UnknownNameError
-from kineverse.geometry.objects import matches_pattern
 from kineverse.grasping import Gripper, Handle, find_handle
 from kineverse.manipulation import (
     ArticulatedObject,

@@ -14,13 +14,13 @@ from dataclasses import dataclass, field
 from types import SimpleNamespace
 from typing import Any
 
+from kineverse._rich_display import element
 from kineverse._runtime import Closing
 from kineverse.exchange import LiveModel
 from kineverse.exchange.state import Newest, StateReader
 from kineverse.lie import Array
 from kineverse.model.commits.follower import Follower, follow
 from kineverse.model.model_view import ModelView
-from kineverse.view.html import element
 from kineverse.view.run_overlay import LiveRun, RunDrawing
 from kineverse.view.viewer import PERIOD, Viewer
 from kineverse.worlds import Contact, Observation

@@ -13,11 +13,11 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from kineverse._names import matches_pattern
 from kineverse.articulations import Fixed, Prismatic, Revolute
 from kineverse.errors import KineverseError
 from kineverse.estimation import Fit, JointVerdict, PlausibilityMonitor, pose_covariance
 from kineverse.estimation.plausibility.report import TestableJoint, find_testable_joints
-from kineverse.geometry.objects import matches_pattern
 from kineverse.grasping.finger_branches import path_to_root
 from kineverse.lie import Array, exp_so3, inverse, pose_difference, transform, translation, unit_vector
 from kineverse.manipulation.unknown_objects.joint_learning import JointLearning, axis_deviation

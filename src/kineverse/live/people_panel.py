@@ -7,13 +7,15 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+from kineverse._rich_display import element
 from kineverse.errors import KineverseError
 from kineverse.exchange import LiveModel
 from kineverse.exchange.state import StateReader
 from kineverse.model.frame import is_of_robot
+from kineverse.model.kinematics import infer_units
 from kineverse.model.model_view import ModelView
-from kineverse.view.html import FONT, HtmlBox, element
-from kineverse.view.sliders import choose_slider_range, choose_slider_step, infer_units, on_input
+from kineverse.view.html import FONT, HtmlBox
+from kineverse.view.sliders import choose_slider_range, choose_slider_step, on_input
 
 from .people import (
     NOISES,

@@ -32,7 +32,7 @@ class CloseLoop(Operation, document_kind="CloseLoop"):
 
     With ``to_T_frame = (R, p)``, the residual consists of the elements of p [m] and of the axis of R times
     the sine of its angle, ½(R - Rᵀ)^∨ [rad], that ``mask`` names, in axes of ``to``. Where they are zero, the
-    dependent coordinates x are a function of the free ones u,
+    dependent coordinates x are a function of the free ones u::
 
         r(x(u), u) = 0,   ∂x/∂u = -(∂r/∂x)⁻¹ ∂r/∂u,
 

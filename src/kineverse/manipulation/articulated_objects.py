@@ -9,8 +9,8 @@ from typing import Literal, TypeAlias, get_args
 
 import numpy as np
 
-from kineverse.errors import UnknownNameError, suggest
-from kineverse.geometry.objects import collision_shapes, matches_pattern
+from kineverse._names import match_names
+from kineverse.geometry.objects import collision_shapes
 from kineverse.geometry.shapes import solid_from_geometry
 from kineverse.lie import Array, inverse, rotation_angle
 from kineverse.model.frame_dependence import moved_frames
@@ -100,16 +100,8 @@ def select_objects(
     objects: Sequence[ArticulatedObject], patterns: Iterable[str]
 ) -> tuple[ArticulatedObject, ...]:
     """Return the objects whose coordinates match names or patterns, in the order of the patterns."""
-    result: dict[Symbol, ArticulatedObject] = {}
-    for pattern in patterns:
-        matching = [one for one in objects if matches_pattern(str(one.coordinate), [pattern])]
-        if not matching:
-            names = [str(one.coordinate) for one in objects]
-            raise UnknownNameError(
-                f"No door, drawer or other object is named '{pattern}'. {suggest(pattern, names, 'object')}"
-            )
-        result.update((one.coordinate, one) for one in matching)
-    return tuple(result.values())
+    by_name = {str(one.coordinate): one for one in objects}
+    return tuple(by_name[name] for name in match_names(patterns, by_name, "door, drawer or other object"))
 
 
 def _find_kind(

@@ -7,9 +7,9 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from kineverse.errors import InvalidValueError, UnknownNameError, suggest
+from kineverse._names import match_names, matches_pattern
+from kineverse.errors import InvalidValueError
 from kineverse.geometry import Rule, Scene
-from kineverse.geometry.objects import matches_pattern
 from kineverse.state import State
 
 _SAMPLES = 24
@@ -18,15 +18,10 @@ _SAMPLES = 24
 def match_bodies(known: Iterable[str], names: str | Iterable[str], argument: str) -> tuple[str, ...]:
     """Return the known bodies that match names or patterns."""
     known = tuple(known)
-    patterns = (names,) if isinstance(names, str) else tuple(names)
-    for pattern in patterns:
-        if not any(matches_pattern(b, (pattern,)) for b in known):
-            raise UnknownNameError(
-                f"{argument}: no body is named or matched by '{pattern}'. {suggest(pattern, known, 'body')}"
-            )
-    if not patterns:
+    matching = match_names(names, known, "body", argument)
+    if not matching:
         raise InvalidValueError(f"{argument} lists no body, so nothing may touch the object.")
-    return tuple(b for b in known if matches_pattern(b, patterns))
+    return tuple(b for b in known if b in matching)
 
 
 def find_overlapping_links(scene: Scene, robot_bodies: tuple[str, ...], state: State) -> tuple[Rule, ...]:

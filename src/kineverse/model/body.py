@@ -28,7 +28,7 @@ Rgba: TypeAlias = tuple[Finite, Finite, Finite, Finite]
 _Rows: TypeAlias = Annotated[tuple[Finite, ...], Meta(min_length=12, max_length=12)]
 
 
-class Pose(Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
+class Pose(Struct, frozen=True, array_like=True, repr_omit_defaults=True, forbid_unknown_fields=True):
     """A constant rigid transform, stored as the 12 numbers of its first three rows.
 
     Examples

@@ -103,6 +103,20 @@ class Diff:
         """The paths of all changes, sorted."""
         return tuple(sorted(c.path for c in self.changes))
 
+    def _repr_html_(self) -> str:
+        from kineverse._rich_display import html_table  # for start-up time
+
+        from .display import format_line
+
+        def line(value: Any) -> str:
+            return "" if value is None else format_line(value)
+
+        rows = [(c.path, line(c.before), line(c.after)) for c in sorted(self.changes, key=lambda c: c.path)]
+        kinds = ("added", "removed", "replaced", "moved", "rerun")
+        rows += [(f"operation {tag}", "", kind) for kind in kinds for tag in getattr(self, kind)]
+        caption = f"{len(self.changes)} changes, version {self.version}"
+        return html_table(caption, ("what", "before", "after"), rows)
+
     @property
     def tags(self) -> frozenset[str]:
         """Tags that were added, removed, replaced, moved or run again."""

@@ -298,6 +298,16 @@ class ValueDifference:
 class ModelComparison:
     """Differences between two models beyond a tolerance."""
 
+    def _repr_html_(self) -> str:
+        from kineverse._rich_display import html_table  # for start-up time
+
+        rows = [
+            (one.sign, one.change.path, ", ".join(part.what for part in one.parts))
+            for one in self.differences
+        ]
+        caption = f"{len(rows)} differences beyond {self.tolerance:g}"
+        return html_table(caption, ("", "what", "parts"), rows)
+
     def __init__(self, before: Model, after: Model, tolerance: float, operations: str = "auto") -> None:
         self.before, self.after, self.tolerance = before, after, tolerance
         self.diff: Diff = compare_models(before, after)

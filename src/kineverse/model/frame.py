@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from .kinematics import Placement
 
 WORLD = "world"
+"""Name of the root frame."""
 
 TransformLike: TypeAlias = "Expression | Pose | npt.ArrayLike"
 

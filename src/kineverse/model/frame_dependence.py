@@ -11,7 +11,7 @@ from kineverse.symbols import Symbol
 
 from .body import is_empty_body
 from .frame import WORLD, Frame
-from .model_view import ModelView
+from .model_view import ModelView, find_symbols
 from .rates import collect_symbols
 
 
@@ -26,7 +26,7 @@ class FrameDependence:
     def __init__(self, model: ModelView, symbols: Iterable[Symbol | str]) -> None:
         self._frames: Mapping[str, Frame] = dict(model.frames)
         known = _known_paths(model)
-        asked = (s if isinstance(s, Symbol) else model.symbol(s) for s in symbols)
+        asked = find_symbols(model, symbols)
         self._paths = _driven_coordinates(model, {_known_path(s, known) for s in asked})
         self._moving_ancestors: dict[str, tuple[str, ...]] = {WORLD: ()}
 
@@ -60,14 +60,14 @@ def moved_frames(model: ModelView, symbols: Iterable[Symbol | str]) -> dict[Symb
     Parameters
     ----------
     symbols
-        Symbols or their names, such as the speeds of a controller.
+        Symbols, their names or patterns, such as the speeds of a controller.
 
     Examples
     --------
     >>> kv.model.moved_frames(kv.load("kitchen"), ["kitchen/fridge_door"])
     {kitchen/fridge_door: ('kitchen/fridge_door', 'kitchen/fridge_door_handle')}
     """
-    asked = [s if isinstance(s, Symbol) else model.symbol(s) for s in symbols]
+    asked = list(find_symbols(model, symbols))
     known = _known_paths(model)
     bits: dict[str, int] = {}  # one bit for each symbol, in the masks of coordinates and of frames
     for i, symbol in enumerate(asked):
@@ -96,7 +96,7 @@ def moving_symbols(model: ModelView, symbols: Iterable[Symbol | str]) -> dict[st
 
     The symbols are compared as in :class:`FrameDependence`. The frames are in the order of the model.
     """
-    asked = [s if isinstance(s, Symbol) else model.symbol(s) for s in symbols]
+    asked = list(find_symbols(model, symbols))
     known = _known_paths(model)
     movers: dict[str, list[Symbol]] = {}
     for symbol in asked:

@@ -1,4 +1,4 @@
-"""Forward kinematics and geometric Jacobians along chains of frames.
+"""Forward kinematics, geometric Jacobians along chains of frames, and units of coordinates.
 
 The pose of a frame is stored as an *anchor*, the product up to the last moving factor, and a constant offset.
 Constants are multiplied numerically before they enter an expression, so rigidly attached frames add no cost.
@@ -6,22 +6,28 @@ Constants are multiplied numerically before they enter an expression, so rigidly
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from typing import TYPE_CHECKING
 
 import casadi as ca
 import numpy as np
 import numpy.typing as npt
 from msgspec import Struct
 
-from kineverse.errors import ModelError
+from kineverse.errors import ModelError, NoSolutionError
 from kineverse.expressions.expression import NO_NODES, Expression, from_casadi
 from kineverse.expressions.layout import SX
 from kineverse.expressions.node import Node
+from kineverse.lie import Array
 from kineverse.spatial import OneAxisTransform, inverse
 from kineverse.symbols import Symbol
 
 from .body import Pose
 from .frame import WORLD, Frame
+
+if TYPE_CHECKING:
+    from .model_view import ModelView
 
 FrameLookup = Callable[[str], Frame]
 
@@ -258,3 +264,62 @@ def _twists(step: ChainStep, tip: SX, heuristic: bool) -> Iterator[tuple[Symbol,
         if linear.nnz():
             velocity = velocity + ca.mtimes(step.rotation, linear)
         yield key, velocity, omega, entry.nodes
+
+
+DIFFERENCE_STEP = 1e-4  # step of the finite differences; their error is its square [unit of the coordinate]
+
+UNIT_TOLERANCE = 1e-5
+
+PROBE_DISTANCES = (0.0, 1.0, -1.0, 0.1, -0.1)
+"""Distances of the probed states from the given values; the later ones are used if earlier ones fail."""
+
+
+def infer_units(model: ModelView, values: Mapping[str, float], names: Iterable[str]) -> dict[str, str]:
+    """Return ``"rad"``, ``"m"`` or ``""`` for each of the named symbols."""
+    from kineverse.compilation import compile  # for start-up time
+
+    wanted = list(names)
+    # In terms of free coordinates: the angles of a closed loop follow its crank.
+    moving = [t for frame in model.frames.values() if (t := model.rates.carry(frame.transform)).symbols]
+    if not moving:
+        return dict.fromkeys(wanted, "")
+    function = compile(moving, tier="interpreter")  # a few calls do not pay for C
+    inputs = [str(symbol) for symbol in function.inputs]
+    base = np.array([values[name] for name in inputs])
+
+    def rates(place: Array, index: int) -> tuple[Array, Array]:
+        offset = np.zeros(len(inputs))
+        offset[index] = DIFFERENCE_STEP
+        with np.errstate(invalid="ignore"):  # Frames without a finite pose have no rates.
+            return _rates(np.array(function(place - offset)), np.array(function(place + offset)))
+
+    found = dict.fromkeys(wanted, "")
+    # A second state excludes coordinates that move by one radian a unit only by chance.
+    off = 0.1 + 0.01 * np.arange(len(base))
+    for name in wanted:
+        if name not in inputs:
+            continue
+        seen = []
+        for distance in PROBE_DISTANCES:
+            # Loops do not close everywhere; two states are enough.
+            with suppress(NoSolutionError):
+                seen.append(rates(base + distance * off, inputs.index(name)))
+            if len(seen) == 2:
+                break
+        if len(seen) < 2:
+            continue
+        turning = np.all([np.abs(turn - 1.0) < UNIT_TOLERANCE for turn, _ in seen], axis=0)
+        shifting = np.all(
+            [(turn < UNIT_TOLERANCE) & (np.abs(s - 1.0) < UNIT_TOLERANCE) for turn, s in seen], axis=0
+        )
+        found[name] = "rad" if turning.any() else "m" if shifting.any() else ""
+    return found
+
+
+def _rates(before: Array, after: Array) -> tuple[Array, Array]:
+    """Return the (N,) rates of rotation [rad] and translation [m] a unit, from poses two steps apart."""
+    # The antisymmetric part of R_before' R_after has the norm √2 |sin| of the angle between them.
+    change = np.einsum("nji,njk->nik", before[:, :3, :3], after[:, :3, :3])
+    sine = np.linalg.norm(change - np.swapaxes(change, 1, 2), axis=(1, 2)) / np.sqrt(8.0)
+    shift = np.linalg.norm(after[:, :3, 3] - before[:, :3, 3], axis=1)
+    return np.asarray(sine / (2.0 * DIFFERENCE_STEP)), np.asarray(shift / (2.0 * DIFFERENCE_STEP))

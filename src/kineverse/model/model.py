@@ -295,8 +295,8 @@ class Model(ModelView):
         tags
             Tags of operations that are added, removed, replaced, moved or run again.
         frames
-            Frames whose forward kinematics are followed: their own frames and rates, and those of all frames
-            above them. The diff names those that moved in ``poses``.
+            Frames, or patterns such as ``kitchen/*``, whose forward kinematics are followed: their own frames
+            and rates, and those of all frames above them. The diff names those that moved in ``poses``.
 
         Examples
         --------

@@ -7,13 +7,20 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from kineverse._checks import check_flag
-from kineverse.errors import DuplicateNameError, InvalidValueError, UnknownNameError, suggest
+from kineverse._names import is_pattern, matches_pattern, no_match_error
+from kineverse.errors import (
+    DuplicateNameError,
+    ExpressionError,
+    InvalidValueError,
+    UnknownNameError,
+    suggest,
+)
 from kineverse.expressions.expression import Expression, ExpressionLike
 from kineverse.expressions.substitution import apply_substitution
 from kineverse.state import State, StateLike, as_state, check_meant
@@ -21,6 +28,7 @@ from kineverse.symbols import Symbol, check_symbols, parse_symbol_name
 
 from . import registry
 from .constraint import TOLERANCE, Constraint, ConstraintLike, as_constraint
+from .display import count_values
 from .operation import ARTICULATIONS, CONSTRAINTS, map_expressions
 from .registry import SaveResult, SourceFile
 from .symbolic_view import SymbolicView, cached_for_version
@@ -623,23 +631,49 @@ class ModelView(SymbolicView):
 
     def __str__(self) -> str:
         return (
-            f"{len(self.frames)} frames, {len(self.degrees_of_freedom)} DoF, "
-            f"{len(self.constraints)} constraints (version {self.version})"
+            f"{count_values(len(self.frames), 'frames')}, {len(self.degrees_of_freedom)} DoF, "
+            f"{count_values(len(self.constraints), 'constraints')} (version {self.version})"
         )
 
     def __repr__(self) -> str:
         return f"<{type(self).__name__}: {self}>"
 
     def _repr_html_(self) -> str:
-        from html import escape
+        from .display import model_html  # for start-up time
 
         with self._lock:
-            mappings = [self.frames, self.articulations, self.constraints, self.bodies, self.data]
-            parts = [part._repr_html_() for part in mappings if part]  # type: ignore[attr-defined]
-            parts += [self.rates._repr_html_()] if self.rates else []
-        tables = "".join(
-            f"<details><summary>{escape(part.partition('<caption>')[2].partition('</caption>')[0])}</summary>"
-            f"{part}</details>"
-            for part in parts
-        )
-        return f"<div><p>{escape(str(self))}</p>{tables}</div>"
+            return model_html(self)
+
+
+def find_symbols(
+    model: ModelView, names: Symbol | str | Iterable[Symbol | str], argument: str = ""
+) -> Iterator[Symbol]:
+    """Yield the symbols of names or patterns; an articulation stands for its coordinates.
+
+    A pattern stands for the degrees of freedom that match, else for those of the articulations that match.
+    Messages begin with the argument, such as ``fixed=``.
+    """
+    coordinates = set(map(str, model.symbols))
+    for item in (names,) if isinstance(names, str | Symbol) else names:
+        if isinstance(item, Symbol):
+            yield item
+        elif not isinstance(item, str):
+            raise ExpressionError(f"{argument or 'This'} takes symbols or their names, not {item!r:.80}.")
+        elif item in model.articulations and item not in coordinates:
+            yield from model.articulations[item].coordinates
+        elif is_pattern(item) and item not in coordinates:
+            yield from _match_symbols(model, item, argument)
+        else:
+            yield model.symbol(item)
+
+
+def _match_symbols(model: ModelView, pattern: str, argument: str) -> list[Symbol]:
+    free = {str(s): s for s in model.degrees_of_freedom}
+    found = [s for name, s in free.items() if matches_pattern(name, (pattern,))]
+    joints = {name: joint.coordinates for name, joint in model.articulations.items() if joint.coordinates}
+    found = found or [
+        s for name, several in joints.items() if matches_pattern(name, (pattern,)) for s in several
+    ]
+    if not found:
+        raise no_match_error(pattern, [*free, *joints], "coordinate", argument)
+    return found

@@ -6,6 +6,7 @@ returns :class:`Writes`. The reads are recorded, so the operation is applied aga
 
 from __future__ import annotations
 
+import inspect
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, fields, replace
@@ -29,6 +30,15 @@ if TYPE_CHECKING:
 
 KINDS = ("frames", "bodies", "articulations", "constraints", "rates", "data")
 FRAMES, BODIES, ARTICULATIONS, CONSTRAINTS, RATES, DATA = KINDS
+
+
+class _Signature:
+    """Signature of an operation: that of ``__init__``, as ``__new__`` takes anything."""
+
+    def __get__(self, operation: object, owner: type) -> inspect.Signature:
+        found = inspect.signature(owner.__init__)  # type: ignore[misc]
+        _, *parameters = found.parameters.values()
+        return found.replace(parameters=parameters, return_annotation=inspect.Signature.empty)
 
 
 @dataclass(frozen=True)
@@ -203,6 +213,8 @@ class Operation(ABC):
     """Frozen name of the class in documents, in kinds of articulations and in tags."""
 
     _tag: ClassVar[str]
+
+    __signature__ = _Signature()
 
     def __init_subclass__(cls, *, document_kind: str = "", tag: str = "", **keywords: Any) -> None:
         """Name a class in documents, frozen for those that ship, else its own name; and in default tags."""

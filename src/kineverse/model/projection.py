@@ -20,8 +20,9 @@ from typing import Any
 import numpy as np
 
 from kineverse._checks import as_tolerance
+from kineverse._names import match_names
 from kineverse.compilation import compile
-from kineverse.errors import NoSolutionError, UnknownNameError, list_some, suggest
+from kineverse.errors import NoSolutionError, UnknownNameError, list_some
 from kineverse.expressions.expression import Expression, array
 from kineverse.lie import Array
 from kineverse.state import State
@@ -183,21 +184,13 @@ def _fixed_coordinates(equalities: EqualityConstraints, fixed: Iterable[Symbol |
     by_name = {str(s): s for s in equalities.symbols}
     by_name |= {str(s): s for record in records.values() for s in record.coordinates}
     found: set[Symbol] = set()
-    if not isinstance(fixed, Iterable):
-        raise UnknownNameError(f"What stays fixed is given as names of coordinates, not as {fixed!r}.")
-    for item in [fixed] if isinstance(fixed, (str, Symbol)) else fixed:
-        name = str(item)
+    for name in match_names(fixed, [*by_name, *dependent, *records], "coordinate", "fixed="):
         if name in dependent:
             found.update(s for s in dependent[name].symbols if s.has_derivative)
         elif name in by_name:
             found.add(by_name[name])
-        elif name in records:
-            found.update(records[name].coordinates)
         else:
-            available = {*by_name, *dependent, *records}
-            raise UnknownNameError(
-                f"{name!r} cannot stay fixed: it is no coordinate. {suggest(name, available, 'coordinate')}"
-            )
+            found.update(records[name].coordinates)
     return frozenset(found)
 
 

@@ -27,7 +27,7 @@ from kineverse.expressions.node import Node
 from kineverse.expressions.substitution import apply_substitution, compose_gradient, replace_nodes
 from kineverse.symbols import Symbol
 
-from .display import as_html, as_lines
+from .display import as_html, as_lines, count_values
 
 if TYPE_CHECKING:
     from kineverse.expressions.substitution import Substitution
@@ -396,7 +396,7 @@ class Rates(Mapping[Symbol, Mapping[Symbol, Expression]]):
     @property
     def _title(self) -> str:
         dependent = f" and {len(self.dependent)} dependent coordinates" if self.dependent else ""
-        return f"{len(self)} rates{dependent}"
+        return f"{count_values(len(self), 'rates')}{dependent}"
 
     def __eq__(self, other: object) -> bool:
         return self.key == other.key if isinstance(other, Rates) else NotImplemented

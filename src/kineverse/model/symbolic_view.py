@@ -22,7 +22,7 @@ from . import kinematics, mass_properties
 from .articulation import Articulation
 from .body import Body
 from .constraint import Constraint
-from .display import as_html, as_lines
+from .display import as_html, as_lines, count_values
 from .frame import WORLD, Frame
 from .operation import ARTICULATIONS, BODIES, CONSTRAINTS, DATA, FRAMES, RATES, Cell, map_expressions
 from .rates import RateEntry, Rates
@@ -89,12 +89,12 @@ class NamedMapping(Mapping[str, Any]):
 
     @property
     def _title(self) -> str:
-        return f"{len(self)} {self._kind}"
+        return count_values(len(self), self._kind)
 
     def __repr__(self) -> str:
         names = list(self)
         shown = ", ".join(names[:8])
-        return f"<{len(names)} {self._kind}: {shown}{', ...' if len(names) > 8 else ''}>"
+        return f"<{count_values(len(names), self._kind)}: {shown}{', ...' if len(names) > 8 else ''}>"
 
 
 JacobianForm = Literal["world_aligned", "world", "body"]

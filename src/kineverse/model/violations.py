@@ -11,13 +11,14 @@ import numpy as np
 import numpy.typing as npt
 
 from kineverse._checks import as_tolerance
+from kineverse._rich_display import element, html_table
 from kineverse.compilation.function import WantedTier, compile_columns, insert_values
 from kineverse.errors import UnknownNameError
 from kineverse.expressions.expression import Expression, as_expression
 from kineverse.expressions.graph import lower
 from kineverse.expressions.implicit import implicit_nodes
 from kineverse.expressions.layout import SX
-from kineverse.expressions.printing import html_table
+from kineverse.expressions.printing import format_number
 from kineverse.state import State, StateLike, as_state
 from kineverse.symbols import Symbol
 
@@ -58,17 +59,19 @@ class Violations(tuple[Violation, ...]):
 
     def __repr__(self) -> str:
         lines = [
-            f"  {v.name}: {v.lower:g} <= {v.value:g} <= {v.upper:g} "
+            f"  {v.name}: {v.lower + 0:g} <= {v.value + 0:g} <= {v.upper + 0:g} "  # without the sign of -0
             + ("has no value here" if math.isnan(v.excess) else f"is off by {v.excess:g}")
             for v in self
         ]
         return f"{len(self)} violated\n" + "\n".join(lines) if lines else "none violated"
 
     def _repr_html_(self) -> str:
-        rows = [(v.name, f"{v.lower:g}", f"{v.value:g}", f"{v.upper:g}", f"{v.excess:g}") for v in self]
+        rows = [(v.name, *(format_number(x, 6) for x in (v.lower, v.value, v.upper, v.excess))) for v in self]
         caption = f"{len(self) or 'none'} violated"
         if self.unchecked:
             caption += f", {len(self.unchecked)} unchecked"
+        if not rows:
+            return element("p", caption)
         return html_table(caption, ("constraint", "lower", "value", "upper", "excess"), rows)
 
 

@@ -12,7 +12,11 @@ import numpy as np
 import numpy.typing as npt
 
 from kineverse._checks import finite_number
+from kineverse._names import answer_foreign_names
+from kineverse._rich_display import draw_curves, element, html_table, picture_element
+from kineverse._synonyms import PATH_SYNONYMS
 from kineverse.errors import InvalidValueError
+from kineverse.expressions.printing import format_number
 from kineverse.lie import Array
 from kineverse.state import State
 from kineverse.symbols import Symbol
@@ -25,6 +29,7 @@ from .trajectories.kinematic_limits import RAMP
 DEVIATION = 0.1  # largest distance of a trajectory from the corners of a path in free space [rad], [m]
 
 
+@answer_foreign_names("A path", PATH_SYNONYMS)
 @dataclass(frozen=True, eq=False)
 class Path:
     """Result of :meth:`.Planner.plan`.
@@ -204,6 +209,22 @@ class Path:
         if self.found:
             return f"<Path: {len(self.points)} points, length {self.length:.3g}, {1e3 * self.seconds:.3g} ms>"
         return f"<Path: not found. {self.why}>"
+
+    def _repr_html_(self) -> str:
+        names = [str(symbol) for symbol in self.symbols]
+        if not self.found:
+            return element("p", repr(self))
+        lengths = lengths_along(self.points)
+        curves = draw_curves(lengths, self.points, names, xlabel="length [rad], [m]")
+        rows = [
+            (name, *map(format_number, (*column[[0, -1]], column.min(), column.max())))
+            for name, column in zip(names, self.points.T, strict=True)
+        ]
+        caption = (
+            f"path of {len(self)} points, length {self.length:.3g}, found in {1e3 * self.seconds:.3g} ms"
+        )
+        table = html_table(caption, ("coordinate", "begin", "end", "least", "largest"), rows)
+        return element("div", *([] if curves is None else [picture_element(curves, caption)]), table)
 
 
 def _as_numbers(name: str, value: Any) -> Array:

@@ -11,7 +11,9 @@ import numpy as np
 import numpy.typing as npt
 
 from kineverse._checks import as_count, as_entries, as_tolerance
+from kineverse._names import answer_foreign_names
 from kineverse._runtime import CallLock, no_collection, one_at_a_time
+from kineverse._synonyms import PLANNER_SYNONYMS
 from kineverse.control.tasks import Goal, Hold
 from kineverse.errors import InvalidValueError, ShapeError
 from kineverse.expressions.expression import ExpressionLike
@@ -40,6 +42,7 @@ _TRIES = 2048  # number of random configurations that say whether tasks are out 
 _METHODS = ("rrt-connect", "prm")
 
 
+@answer_foreign_names("A planner", PLANNER_SYNONYMS)
 class Planner:
     """Planner of paths without collisions, for any coordinates of a model.
 

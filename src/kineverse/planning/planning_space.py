@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from fnmatch import fnmatchcase
 from typing import Any
 
 import numpy as np
 
 from kineverse.control.configuration_space import ConfigurationSpace, find_coordinates
-from kineverse.errors import InvalidValueError, ShapeError, UnknownNameError, suggest
+from kineverse.errors import InvalidValueError, ShapeError
 from kineverse.expressions.expression import Expression, as_expression
 from kineverse.expressions.functions import maximum
 from kineverse.lie import Array
@@ -22,7 +21,6 @@ from kineverse.symbols import Symbol
 
 from .bindings import MOST_COORDINATES
 
-_WILDCARDS = "*?["
 _LARGEST = 1e6  # largest coordinate of a configuration [rad], [m]; edges are computed in single precision
 HALF_TURN, FULL_TURN = math.pi + 0.3, math.tau + 0.3
 """Angles by which joints that turn fully may turn to either side of the start: the short way, and the long
@@ -218,19 +216,10 @@ def read_state(model: ModelView, state: Any) -> State:
 
 
 def _find_moving(model: ModelView, move: Iterable[Symbol | str] | Symbol | str) -> tuple[Symbol, ...]:
-    names = {str(s): s for s in model.degrees_of_freedom}
     result: dict[Symbol, None] = {}
     for item in (move,) if isinstance(move, Symbol | str) else tuple(move):
-        if isinstance(item, str) and any(sign in item for sign in _WILDCARDS):
-            matching = [s for name, s in names.items() if fnmatchcase(name, item)]
-            if not matching:
-                raise UnknownNameError(
-                    f"move=: no coordinate matches '{item}'. {suggest(item, names, 'coordinate')}"
-                )
-            result.update(dict.fromkeys(matching))
-        else:
-            chosen = find_coordinates(model, [item], "move")
-            result.update(dict.fromkeys(sorted(chosen, key=lambda s: s.sort_key)))
+        chosen = find_coordinates(model, [item], "move")
+        result.update(dict.fromkeys(sorted(chosen, key=lambda s: s.sort_key)))
     rolling = [s for s in result if s in _rolling_coordinates(model)]
     if rolling:
         raise InvalidValueError(

@@ -14,6 +14,7 @@ from kineverse.symbols import Symbol
 from .boxes import IntervalBox, axis_name
 
 Hold = Literal["stands still", "cannot increase", "cannot decrease", "stays within", "has no value"]
+"""Effect of an interlock on what it holds; see :class:`Interlock`."""
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from typing import Any
 from kineverse._checks import finite_number
 from kineverse.errors import InvalidValueError
 from kineverse.expressions.printing import format_number
-from kineverse.model.model_view import ModelView
+from kineverse.model.model_view import ModelView, find_symbols
 from kineverse.state import StateLike
 from kineverse.symbols import Symbol
 
@@ -223,7 +223,7 @@ def plan_unlocking(
     limits = constant_limits(dict(model.constraints.items()))
     goals = {model.degree_of_freedom(name): value for name, value in goal.items()}
     goals = {s: _check_goal(s, value, limits.get(s, Interval())) for s, value in goals.items()}
-    resting = tuple(model.degree_of_freedom(name) for name in fixed)
+    resting = tuple(model.degree_of_freedom(s) for s in find_symbols(model, fixed, "fixed="))
     known = interlocks(model) if found is None else found
     end = perf_counter() + budget
     coordinates, rules = relevant_rules(make_rules(model, known), goals)

@@ -34,13 +34,13 @@ class AccessControl:
     """Rule by which requests are answered or refused."""
 
     host: str  # address that the server is bound to
-    token: str = field(repr=False)  # first part of every path; empty for a page of this computer alone
+    token: str = field(repr=False)  # first part of every path; may be empty for a page of this computer alone
 
     @staticmethod
-    def from_host(host: str) -> AccessControl:
-        """Return the rule for a host: without a token on this computer, with a random one elsewhere."""
+    def from_host(host: str, *, secret: bool = False) -> AccessControl:
+        """Return the rule for a host: with a random token, except on this computer if none is wanted."""
         alone = host in ("localhost", "::1") or host.startswith("127.")
-        return AccessControl(host, "" if alone else secrets.token_urlsafe(24))
+        return AccessControl(host, "" if alone and not secret else secrets.token_urlsafe(24))
 
     def address(self, port: int) -> str:
         """Return the address of the page, token included."""

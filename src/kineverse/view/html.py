@@ -1,35 +1,14 @@
-"""HTML of the page.
-
-Elements with escaped text, the only place in which names and messages become HTML, and reports of violated
-constraints and failures.
-"""
+"""HTML of the page: exchangeable boxes, and reports of violated constraints and failures."""
 
 from __future__ import annotations
 
-import html
 from collections.abc import Iterable, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any
 
+import numpy as np
 
-class Html(str):
-    """Text that is HTML already."""
-
-    __slots__ = ()
-
-
-def element(tag: str, *content: str, style: str = "", **attributes: object) -> Html:
-    """Return an HTML element; its content is escaped, unless it is :class:`Html`."""
-    named = {name.rstrip("_").replace("_", "-"): value for name, value in attributes.items()}
-    shown = {**({"style": style} if style else {}), **named}
-    opened = "".join(f' {name}="{html.escape(str(value))}"' for name, value in shown.items())
-    inside = "".join(text if isinstance(text, Html) else html.escape(text) for text in content)
-    return Html(f"<{tag}{opened}>{inside}</{tag}>")
-
-
-def join_html(*content: str) -> Html:
-    """Concatenate content; text that is not :class:`Html` is escaped."""
-    return Html("".join(text if isinstance(text, Html) else html.escape(text) for text in content))
+from kineverse._rich_display import Html, element
 
 
 class HtmlBox:
@@ -110,7 +89,15 @@ def format_missing_meshes(problems: Sequence[str]) -> Html:
     return colored_box(_RED, _LIGHT_RED, element("b", f"{len(problems)} {noun} could not be loaded"), *lines)
 
 
+_NEGLIGIBLE = 1e-9  # what is smaller is 0: rounding of a file's units
+
+
 def format_significant(value: float) -> str:
     """Format a number with at most 4 significant digits and a legible minus sign."""
+    if abs(value) < _NEGLIGIBLE:
+        return "0"
+    # Exponents only where the digits would be many.
     text = f"{value:.4g}"
+    if "e" in text and 1e-6 <= abs(value) < 1e6:
+        text = np.format_float_positional(float(text), trim="-")
     return text.replace("-", "−").replace("inf", "∞")

@@ -40,12 +40,18 @@ class DirectionalLight:
     bias: float
 
     @staticmethod
-    def from_direction(corners: Floats, azimuth: float, elevation: float) -> DirectionalLight:
-        """Return the lamp in a direction [rad] above (T, 3, 3) triangles [m]."""
+    def from_direction(
+        corners: Floats, azimuth: float, elevation: float, around: Floats | None = None
+    ) -> DirectionalLight:
+        """Return the lamp in a direction [rad] above (T, 3, 3) triangles [m].
+
+        The shadow map covers the points ``around`` (N, 3) [m], so that those of one film are alike; None for
+        the triangles alone.
+        """
         toward = unit_direction(azimuth, elevation)
         right = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
         axes = np.array([right, np.cross(toward, right), -toward])
-        points = corners.reshape(-1, 3)
+        points = corners.reshape(-1, 3) if around is None else around
         low, high = (points @ axes.T).min(axis=0), (points @ axes.T).max(axis=0)
         spread = max(float((high - low)[:2].max()), 1e-3)
         focal = 0.98 * SHADOW_PIXELS / spread
@@ -153,10 +159,10 @@ def draw_background(projection: Projection) -> Singles:
 
 
 def draw_ground(
-    image: Singles, empty: Integers, corners: Floats, projection: Projection, lamp: DirectionalLight
+    image: Singles, empty: Integers, points: Floats, projection: Projection, lamp: DirectionalLight
 ) -> None:
-    """Draw the floor under a scene: its shadow, and a grid that fades into the background."""
-    low, high = corners.reshape(-1, 3).min(axis=0), corners.reshape(-1, 3).max(axis=0)
+    """Draw the floor under the points (N, 3) of a scene: its shadow, and a grid that fades at a distance."""
+    low, high = points.min(axis=0), points.max(axis=0)
     drop = np.float32(low[2] - projection.origin[2])
     rays = projection.pixel_rays(empty)
     down = np.flatnonzero(rays[:, 2] < -1e-6)

@@ -7,7 +7,7 @@ import sys
 from contextlib import suppress
 from typing import TYPE_CHECKING
 
-from kineverse.errors import KineverseError
+from kineverse.errors import KineverseError, MissingDependencyError
 from kineverse.formats.files import read_file
 from kineverse.formats.locate import locate_model
 from kineverse.formats.xml_reader import Element, Visit, parse_xml
@@ -17,7 +17,8 @@ from kineverse.state import StateLike
 
 if TYPE_CHECKING:
     from .camera import Camera
-    from .viewer import Viewer  # for start-up time
+    from .notebook import ModelPicture  # for start-up time
+    from .viewer import Viewer
 
 
 def show(
@@ -31,13 +32,13 @@ def show(
     label: str | None = None,
     camera: Camera | None = None,
     degrees: bool = False,
-) -> Viewer:
+) -> Viewer | ModelPicture:
     """Show a model on a web page, with a slider for each degree of freedom.
 
     In a script this opens the browser and blocks until Ctrl-C; then the page is taken down and the script
     goes on. Closing the page in the browser changes nothing. At a prompt it returns at once. So it does in a
-    notebook, in which the result of a cell is the page itself. The address of the page is written to standard
-    error.
+    notebook, in which the result of a cell is the page itself, with a picture where the page is not reached.
+    The address of the page is written to standard error, except in a notebook.
 
     Parameters
     ----------
@@ -64,12 +65,13 @@ def show(
 
     Returns
     -------
-    The page, up unless this has waited: ``move``, ``play`` and ``stop`` are among its methods.
+    The page, up unless this has waited: ``move``, ``play`` and ``stop`` are among its methods. In a notebook
+    without viser, a picture, which has ``move`` and ``stop`` only.
 
     Raises
     ------
     MissingDependencyError
-        If viser is not installed.
+        If viser is not installed, and this is no notebook.
     InvalidValueError
         If the model is none, the port is taken or no port, or the host is not one of this computer.
 
@@ -79,15 +81,19 @@ def show(
     >>> page.move({"kitchen/fridge_door": 0.8})
     >>> page.stop()
     """
-    from .viewer import Viewer  # for start-up time
+    from .notebook import ModelPicture, find_shell, is_in_notebook  # for start-up time
+    from .viewer import Viewer
 
-    ipython = sys.modules.get("IPython")
-    shell = None if ipython is None else ipython.get_ipython()
-    notebook = getattr(shell, "kernel", None) is not None  # whose front end shows results of cells as HTML
+    notebook = is_in_notebook()
     # At a prompt, and in a script that ends in one, nothing waits.
-    prompt = hasattr(sys, "ps1") or bool(sys.flags.interactive) or shell is not None
+    prompt = hasattr(sys, "ps1") or bool(sys.flags.interactive) or find_shell() is not None
     waits = not prompt if block is None else block
-    page = Viewer(model, state, port=port, host=host, label=label, camera=camera, degrees=degrees)
+    try:
+        page = Viewer(model, state, port=port, host=host, label=label, camera=camera, degrees=degrees)
+    except MissingDependencyError as error:
+        if not notebook:
+            raise
+        return ModelPicture(model, state, camera=camera, note=str(error))
     try:
         if not notebook:
             print(

@@ -2,23 +2,29 @@
 
 from __future__ import annotations
 
-import math
 import threading
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
+from kineverse._rich_display import Html, element
+from kineverse.model.constraint import Constraint
+
 from .animation import VelocityDrive
-from .html import Html, HtmlBox, element, format_missing_meshes, format_significant, format_violations
+from .dragging import FrameDrag
+from .html import HtmlBox, format_missing_meshes, format_significant, format_violations
 from .proximity_panel import ProximityPanel
 from .scene import ViewerScene
-from .sliders import QuaternionAngles, Ranges, choose_slider_range, choose_slider_step, on_input
+from .sliders import (
+    DisplayUnits,
+    QuaternionAngles,
+    Ranges,
+    choose_slider_range,
+    choose_slider_step,
+    on_input,
+)
 
 BEYOND = 0.2  # fraction of their range by which sliders are widened on demand, to violate limits
 MOST_UNFOLDED = 100  # with at most so many degrees of freedom all groups are unfolded at first
-_NEGLIGIBLE = 1e-9  # limits below this are 0 in labels: rounding of a file's units
-
-DEGREES = {"rad": ("°", math.degrees(1.0)), "rad/s": ("°/s", math.degrees(1.0))}
-"""The unit of angles in degrees, by unit, and the factor from radians."""
 
 STYLE = """
 .mantine-Slider-markLabel { display: none }
@@ -30,11 +36,10 @@ STYLE = """
 .mantine-Flex-root:has(> div > p > label):has(.mantine-Checkbox-root) > div:first-child {
   width: auto !important; min-width: 6.5em; white-space: nowrap }
 @media (max-width: 36em) {
-  .mantine-Paper-root[style*="position: fixed"] { width: 100% !important; max-height: 45% !important }
+  div:has(> .mantine-Paper-root[style*="position: fixed"]) { flex-direction: column }
+  .mantine-Paper-root[style*="position: fixed"] {
+    position: static !important; flex-shrink: 0; width: 100% !important; max-height: 40% !important }
   .mantine-Paper-root[style*="position: fixed"] .mantine-ScrollArea-content > div { width: 100% !important }
-  [data-dock-root] > div:first-child { bottom: 45% !important }
-  body:has(.mantine-ScrollArea-content > div > div:first-child + [aria-hidden="true"])
-    [data-dock-root] > div:first-child { bottom: 3.5em !important }
 }
 """
 """Sliders below their names, which include the range; on a phone the panel is a sheet below the scene."""
@@ -53,13 +58,14 @@ class Panel:
         drive: VelocityDrive,
         units: Mapping[str, str],
         values: Mapping[str, float],
+        drag: FrameDrag,
         *,
         on_move: Callable[[str, float], None],
         on_drive: Callable[[str, float], None],
         on_reset: Callable[[], None],
         on_play: Callable[[bool], None],
         on_convert: Callable[[], None],
-        degrees: bool = False,
+        display: DisplayUnits,
         sliders: bool = True,
     ) -> None:
         self._gui, self._ranges, self._units, self._on_move = gui, ranges, dict(units), on_move
@@ -68,8 +74,8 @@ class Panel:
         self._locked: dict[str, bool] = {}
         # Events of the page and the motion of the model come from different threads.
         self._changing = threading.RLock()
-        self.degrees = degrees  # whether angles are shown in degrees
-        self._quaternions, self._drive, self._proximity = quaternions, drive, proximity
+        self._display = display
+        self._quaternions, self._drive, self._proximity, self._drag = quaternions, drive, proximity, drag
         self._limits = {**ranges.limits_at(values), **quaternions.limits}
         self._sliders: dict[str, Any] = {}
         self._speeds: dict[str, Any] = {}
@@ -85,6 +91,7 @@ class Panel:
             with tabs.add_tab("Move") if sliders else gui.add_folder(None, visible=False):
                 self._add_controls(on_reset, on_play)
                 if sliders:
+                    drag.add_controls(gui)
                     self._add_sliders({**values, **quaternions.angles})
                 if sliders and drive.speeds:
                     self._add_speeds(on_drive)
@@ -95,6 +102,7 @@ class Panel:
     def remove(self) -> None:
         """Remove the panel from the page."""
         self._proximity.forget_folder()
+        self._drag.forget_controls()
         self._root.remove()
 
     def show(self, status: Html) -> None:
@@ -143,8 +151,14 @@ class Panel:
             hint=f"Widen all sliders by {BEYOND:.0%}, and ignore locks, to see limits violated.",
         )
         self._beyond.on_update(lambda _: self._widen())
-        degrees = gui.add_checkbox("degrees", self.degrees, hint="Show angles in degrees instead of radians.")
-        degrees.on_update(lambda event: self._convert(event.target.value))
+        degrees = gui.add_checkbox(
+            "degrees", self._display.degrees, hint="Show angles in degrees instead of radians."
+        )
+        degrees.on_update(lambda event: self._convert(degrees=event.target.value))
+        centimetres = gui.add_checkbox(
+            "centimetres", self._display.centimetres, hint="Show lengths in centimetres instead of metres."
+        )
+        centimetres.on_update(lambda event: self._convert(centimetres=event.target.value))
         self.playing = gui.add_checkbox("play", False, hint="Move everything through its range.")
         on_input(self.playing, on_play)
 
@@ -158,11 +172,9 @@ class Panel:
             self._folders[group] = folder
             with folder:
                 for name in names:
-                    lower, upper = map(format_significant, self._limits[name])
-                    about = f"limits {lower} to {upper} {self._units.get(name, '')}".rstrip()
                     range_ = self._range(name, values[name])
                     self._sliders[name] = self._add_slider(
-                        name, values[name], self._limits, range_, about, self._on_move
+                        name, values[name], self._limits, range_, self._on_move
                     )
 
     def _add_speeds(self, on_drive: Callable[[str, float], None]) -> None:
@@ -172,9 +184,7 @@ class Panel:
             for name in self._drive.speeds:
                 path = name.removesuffix(":velocity")
                 self._units[name] = f"{self._units[path]}/s" if self._units.get(path) else ""
-                slowest, fastest = map(format_significant, limits[name])
-                about = f"from {slowest} to {fastest} {self._units[name]}; it goes on until this is 0"
-                self._speeds[name] = self._add_slider(name, 0.0, limits, limits[name], about, on_drive)
+                self._speeds[name] = self._add_slider(name, 0.0, limits, limits[name], on_drive)
 
             def stop(_: Any) -> None:
                 for name in self._speeds:
@@ -188,17 +198,17 @@ class Panel:
         value: float,
         limits: Mapping[str, tuple[float, float]],
         range_: tuple[float, float],
-        about: str,
         call: Callable[[str, float], None],
     ) -> Any:
         low, high = (self._to_shown(name, end) for end in range_)
+        label, hint = self._describe(name, limits[name])
         slider = self._gui.add_slider(
-            self._label(name, limits[name]),
+            label,
             min=low,
             max=high,
             step=choose_slider_step((low, high)),
             initial_value=self._to_shown(name, value),
-            hint=f"{name}, {about}",
+            hint=hint,
         )
         slider.precision = _count_digits(low, high)
 
@@ -211,24 +221,35 @@ class Panel:
         on_input(slider, move)
         return slider
 
-    def _label(self, name: str, limits: tuple[float, float], locked: bool = False) -> str:
-        """Return the last part of a name with unit and range, such as ``door [rad]   0 to 1.57``."""
-        unit = self._unit(name)
-        low, high = (_format_short(self._to_shown(name, end)) for end in limits)
-        last = name.removesuffix(":velocity").rpartition("/")[2]
-        return f"{last}{f' [{unit}]' if unit else ''}   {low} to {high}{' · locked' if locked else ''}"
-
-    def _unit(self, name: str) -> str:
-        unit = self._units.get(name, "")
-        return DEGREES[unit][0] if self.degrees and unit in DEGREES else unit
+    def _describe(self, name: str, limits: tuple[float, float], locked: bool = False) -> tuple[str, str]:
+        """Return label and hint of a slider, with unit and limits; the hint has the whole name."""
+        factor, unit = self.scale(name)
+        low, high = (format_significant(factor * end) for end in limits)
+        path = name.removesuffix(":velocity")
+        label = f"{path.rpartition('/')[2]}{f' [{unit}]' if unit else ''}   {low} to {high}"
+        hint = f"{name}, limits {low} to {high} {unit}".rstrip()
+        if path != name:
+            hint += "; it goes on until this is 0"
+        return (f"{label} · locked", f"{hint}, locked") if locked else (label, hint)
 
     def scale(self, name: str) -> tuple[float, str]:
-        """Return the factor from the units of the model to the units shown of a coordinate, and these."""
-        return self._factor(name), self._unit(name)
+        """Return the factor from the unit of the model to the one shown of a coordinate, and its name."""
+        return self._display.scale(self._units.get(name, ""))
+
+    def scale_constraint(self, constraint: Constraint) -> tuple[float, str]:
+        """Return factor and unit, as :meth:`scale`, of a constraint on a sum or difference of coordinates.
+
+        They are 1 and empty for coordinates of different units, and for other expressions.
+        """
+        slopes = constraint.expression.gradient(heuristic=False).values()
+        units = {self._units.get(str(symbol), "") for symbol in constraint.expression.symbols}
+        # Another factor than ±1 may have a unit itself, such as the lead of a screw.
+        if len(units) != 1 or not all(not s.symbols and abs(float(s)) == 1.0 for s in slopes):
+            return 1.0, ""
+        return self._display.scale(units.pop())
 
     def _factor(self, name: str) -> float:
-        unit = self._units.get(name, "")
-        return DEGREES[unit][1] if self.degrees and unit in DEGREES else 1.0
+        return self.scale(name)[0]
 
     def _to_shown(self, name: str, value: float) -> float:
         return float(value) * self._factor(name)
@@ -248,10 +269,10 @@ class Panel:
                 slider.disabled = locked and not self.beyond
 
     def _relabel(self, name: str) -> None:
-        slider = self._sliders[name]
-        label = self._label(name, self._limits[name], self._locked.get(name, False))
-        if slider.label != label:
-            slider.label = label
+        _set_text(
+            self._sliders[name],
+            *self._describe(name, self._limits[name], self._locked.get(name, False)),
+        )
 
     def _range(self, name: str, value: float) -> tuple[float, float]:
         beyond = BEYOND if self.beyond else 0.0
@@ -268,16 +289,18 @@ class Panel:
                 if self.beyond:
                     slider.disabled = False
 
-    def _convert(self, degrees: bool) -> None:
+    def _convert(self, **units: bool) -> None:
+        """Show numbers in other units."""
         with self._changing:
-            self.degrees = degrees
+            for name, wanted in units.items():
+                setattr(self._display, name, wanted)
             for name, slider in self._sliders.items():
                 self._fit(name, self._shown[name])
                 slider.value = self._to_shown(name, self._shown[name])
             for name, slider in self._speeds.items():
                 _set_range(slider, *(self._to_shown(name, limit) for limit in self._drive.limits[name]))
                 slider.value = self._to_shown(name, self._drive.speeds[name])
-                slider.label = self._label(name, self._drive.limits[name])
+                _set_text(slider, *self._describe(name, self._drive.limits[name]))
         self._on_convert()
 
     def _find(self, text: str) -> None:
@@ -316,10 +339,8 @@ def _set_range(slider: Any, low: float, high: float) -> None:
         slider.precision = _count_digits(low, high)
 
 
-def _format_short(value: float) -> str:
-    """Format a number with two decimals, or with two significant digits if it is small."""
-    if abs(value) < _NEGLIGIBLE:
-        return "0"
-    digits = 2 if abs(value) >= 0.1 else 1 - math.floor(math.log10(abs(value)))
-    text = f"{value:.{digits}f}".rstrip("0").rstrip(".") if abs(value) < 1e6 else f"{value:.3g}"
-    return text.replace("-", "−").replace("inf", "∞")
+def _set_text(slider: Any, label: str, hint: str) -> None:
+    if slider.label != label:
+        slider.label = label
+    if slider.hint != hint:
+        slider.hint = hint

@@ -46,7 +46,9 @@ def check_png_name(path: str | Path) -> None:
     """Check that the name of a file ends in .png, or has no suffix, and that its folder exists."""
     suffix = Path(path).suffix
     if suffix.lower() not in ("", ".png"):
-        raise FormatError(f"Pictures are written as .png, not {suffix}: '{Path(path).with_suffix('.png')}'.")
+        advice = " 'kineverse view' writes clips." if suffix.lower() in CLIP_SUFFIXES else ""
+        png = Path(path).with_suffix(".png")
+        raise FormatError(f"Pictures are written as .png, not {suffix}: '{png}'.{advice}")
     if not Path(path).parent.is_dir():
         raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(Path(path).parent))
 
@@ -73,6 +75,7 @@ def _chunk(kind: bytes, body: bytes) -> bytes:
     return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
 
 
+CLIP_SUFFIXES = (".webp", ".gif")  # of files of clips
 SAMPLES = 2  # number of computed pixels along each edge of a final one
 ARROW = 0.07  # length of arrows at contacts, as a fraction of the height of the picture
 LARGEST = 64_000_000  # most pixels of one picture, computed ones included
@@ -132,14 +135,16 @@ def picture(
     if width < 1 or height < 1 or width * height * SAMPLES**2 > LARGEST:
         raise InvalidValueError(f"a picture of {width} x {height} pixels cannot be made")
     poses, values = FramePoses(model), complete(model, state)
-    at = dict(zip(poses.names, poses.evaluate(values), strict=True))
+    matrices = poses.evaluate(values)
+    at = dict(zip(poses.names, matrices, strict=True))
+    for frame in poses.unplaced(matrices):  # Its bodies are not drawn, as on the page.
+        del at[frame]
     found = None if near is None else ProximityQuery(model, decomposed).evaluate(values, near)
     items = collect_drawables(model, "collision" if collisions else "visual", decomposed)
-    items += overlay
+    items, front = ([part for part in parts if part.frame in at] for parts in ([*items, *overlay], over))
     scene = TriangleSoup.from_drawables(items, at)
     if camera is None:
         camera = choose_camera(scene, weigh_drawables(model, items), at, width / height)
-    front = list(over)
     if frames or not len(scene.corners):
         front += create_axes(model, scene.corners, at)
     if found is not None:
@@ -154,17 +159,25 @@ def draw_picture(
     size: tuple[int, int],
     camera: Camera,
     over: Sequence[Drawable] = (),
+    around: Floats | None = None,
 ) -> npt.NDArray[np.uint8]:
-    """Return a picture of any parts as (height, width, 3) bytes."""
+    """Return a picture of any parts as (height, width, 3) bytes.
+
+    Floor and shadows are those of a scene that fills the points ``around`` (N, 3) [m]; None for the parts.
+    """
     scene, overlay = (TriangleSoup.from_drawables(parts, poses) for parts in (items, over))
-    return _draw(scene, overlay, size, camera)
+    return _draw(scene, overlay, size, camera, around)
 
 
 def _draw(
-    scene: TriangleSoup, over: TriangleSoup, size: tuple[int, int], camera: Camera
+    scene: TriangleSoup,
+    over: TriangleSoup,
+    size: tuple[int, int],
+    camera: Camera,
+    around: Floats | None = None,
 ) -> npt.NDArray[np.uint8]:
     projection = Projection.from_camera(camera, size[0] * SAMPLES, size[1] * SAMPLES)
-    image = _render(scene, projection, camera)
+    image = _render(scene, projection, camera, around)
     _overlay(image, over, projection)
     return _downsample(image, SAMPLES)
 
@@ -195,13 +208,17 @@ def save_picture(path: str | Path, model: ModelView, state: StateLike | None = N
     write_png(path, picture(model, state, **options))
 
 
-def _render(scene: TriangleSoup, projection: Projection, camera: Camera) -> Singles:
+def _render(
+    scene: TriangleSoup, projection: Projection, camera: Camera, around: Floats | None = None
+) -> Singles:
     """Return (height, width, 3) display values of a scene on its ground."""
     image = draw_background(projection)
     if len(scene.corners):
+        points = scene.corners.reshape(-1, 3) if around is None else around
         seen, near = rasterize(projection, scene.corners, scene.closed, scene.colors[:, 3])
         away = np.subtract(camera.position, camera.target)
-        lamp = DirectionalLight.from_direction(scene.corners, float(np.arctan2(away[1], away[0])) + 0.6, 0.85)
+        beside = float(np.arctan2(away[1], away[0])) + 0.6
+        lamp = DirectionalLight.from_direction(scene.corners, beside, 0.85, points)
         covered = np.flatnonzero(seen >= 0)
         if len(covered):
             triangle = seen[covered]
@@ -210,7 +227,7 @@ def _render(scene: TriangleSoup, projection: Projection, camera: Camera) -> Sing
             display = to_display(shade(colors, normals, lamp, lamp.lit_fraction(points, normals, covered)))
             display *= compute_outlines(scene.group[triangle], normals, near, covered, projection)[:, None]
             image[covered] = display
-        draw_ground(image, np.flatnonzero(seen < 0), scene.corners, projection, lamp)
+        draw_ground(image, np.flatnonzero(seen < 0), points, projection, lamp)
     return image.reshape(projection.height, projection.width, 3)
 
 

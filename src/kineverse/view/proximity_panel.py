@@ -10,13 +10,14 @@ from typing import Any
 import numpy as np
 
 from kineverse._extras import install_command
+from kineverse._rich_display import Html, element, join_html
 from kineverse.errors import InvalidValueError
 from kineverse.geometry import DistanceResult
 from kineverse.geometry.exclusions import is_installed
 from kineverse.geometry.shapes import import_coal
 from kineverse.model.model_view import ModelView
 
-from .html import BREAK, FONT, Html, HtmlBox, element, format_significant, join_html
+from .html import BREAK, FONT, HtmlBox, format_significant
 from .proximity import (
     BALL,
     CONTACT,

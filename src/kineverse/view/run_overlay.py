@@ -11,6 +11,7 @@ from typing import Any, Protocol
 import numpy as np
 import numpy.typing as npt
 
+from kineverse._rich_display import element
 from kineverse.errors import InvalidValueError
 from kineverse.lie import rotation_angle
 from kineverse.model.frame import WORLD
@@ -21,7 +22,7 @@ from kineverse.worlds import Contact, RunRecording
 from kineverse.worlds.robot_interface import SkillStep
 
 from .drawables import TRACE, Drawable, Rgba, build_spheres, collect_drawables
-from .html import BREAK, FONT, HtmlBox, element
+from .html import BREAK, FONT, HtmlBox
 from .poses import FramePoses, complete, keep_known, to_wxyz
 from .proximity import build_arrow
 from .triangle_mesh import Floats

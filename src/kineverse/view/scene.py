@@ -8,6 +8,7 @@ from functools import partial
 from typing import Any, Literal
 
 import numpy as np
+import numpy.typing as npt
 
 from kineverse.model.model_view import ModelView
 
@@ -16,7 +17,7 @@ from .auto_camera import ClientCameras, choose_camera, find_extreme_points, refr
 from .camera import Camera
 from .drawables import Drawable, Kind, choose_axis_length, collect_drawables
 from .poses import FramePoses, to_wxyz
-from .rasterizer import TriangleSoup
+from .rasterizer import Projection, TriangleSoup, rasterize
 from .triangle_mesh import Floats, TriangleMesh
 
 FIELD_OF_VIEW, ASPECT = 0.8, 1.25
@@ -49,7 +50,7 @@ class ViewerScene:
             self._kinematics = FramePoses(model)
             self.names = self._kinematics.names
             self.poses = self._replace_non_finite(self._kinematics.evaluate(values), np.eye(4))
-            visuals = collect_drawables(model)
+            self._drawables = visuals = collect_drawables(model)
             self.problems = sorted({f"{part.frame}: {part.problem}" for part in visuals if part.problem})
             with self._server.atomic():
                 self._server.scene.remove_by_name(ROOT)
@@ -95,6 +96,32 @@ class ViewerScene:
     def pose(self, frame: str) -> Floats:
         """Return the pose of a frame that was drawn last, 4×4."""
         return np.array(self.poses[self._kinematics.index(frame)])
+
+    def pick(
+        self, origin: npt.ArrayLike, direction: npt.ArrayLike
+    ) -> tuple[str, tuple[float, float, float]] | None:
+        """Return the frame of the first visible body on a ray, and the point in it [m], or None."""
+        numbers = np.array([origin, direction], dtype=float)
+        if not self._visuals_shown or not np.isfinite(numbers).all() or not numbers[1].any():
+            return None
+        with self._lock:
+            at = {
+                name: pose
+                for name, pose in zip(self.names, self.poses, strict=True)
+                if name not in self.unplaced
+            }
+            parts = [part for part in self._drawables if part.frame in at]
+        # What is seen along a ray is a picture of one pixel.
+        surfaces = TriangleSoup.from_drawables(parts, at)
+        projection = Projection.from_camera(Camera(tuple(numbers[0]), tuple(numbers.sum(axis=0))), 1, 1)
+        (seen,), (nearness,) = rasterize(projection, surfaces.corners, surfaces.closed)
+        if seen < 0:
+            return None
+        frame = parts[surfaces.source[seen]].frame
+        world_T_frame = at[frame]
+        point = projection.origin + projection.axes[2] / nearness - world_T_frame[:3, 3]
+        x, y, z = (point @ world_T_frame[:3, :3]).tolist()
+        return frame, (x, y, z)
 
     def show_frames(self, axes: bool, labels: bool = False, containing: str = "") -> None:
         """Show or hide the axes and the names of the frames whose name contains a text."""

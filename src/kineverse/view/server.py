@@ -32,8 +32,8 @@ _TITLE, _END = b"<title>Viser</title>", b"</body>"
 _OWN = "X-Kineverse"  # header of requests by scripts of the page
 
 
-def start(port: int | None = None, label: str = "", host: str = HOST) -> Any:
-    """Start a viser server that answers requests of its own page only."""
+def start(port: int | None = None, label: str = "", host: str = HOST, *, secret: bool = False) -> Any:
+    """Start a viser server that answers requests of its own page only, at a random address if secret."""
     try:
         import viser
         from viser import infra
@@ -42,7 +42,7 @@ def start(port: int | None = None, label: str = "", host: str = HOST) -> Any:
             f"the page in the browser needs viser: {install_command('view')}"
         ) from error
 
-    access = AccessControl.from_host(host)
+    access = AccessControl.from_host(host, secret=secret)
     gate = _GuardedWebsockets(access, label)
 
     class GuardedWebsockServer(infra.WebsockServer):

@@ -9,18 +9,21 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping
-from contextlib import suppress
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 import kineverse as kv
-from kineverse.errors import NoSolutionError
 from kineverse.model.model_view import ModelView
 from kineverse.state import State
 
+from .html import format_significant
 from .poses import roll_pitch_yaw
-from .triangle_mesh import Floats
+
+DEGREES = {"rad": ("°", math.degrees(1.0)), "rad/s": ("°/s", math.degrees(1.0))}
+CENTIMETRES = {"m": ("cm", 100.0), "m/s": ("cm/s", 100.0)}
+"""The other unit in which numbers may be shown, by unit, and the factor to it."""
 
 UNLIMITED_RANGE = {"rad": np.pi, "m": 2.0, "": 2.0}  # half of the range of a slider without limits [rad], [m]
 
@@ -84,6 +87,25 @@ class Ranges:
         return limits
 
 
+@dataclass
+class DisplayUnits:
+    """Units in which the page shows numbers."""
+
+    degrees: bool = False  # instead of radians
+    centimetres: bool = False  # instead of metres
+
+    def scale(self, unit: str) -> tuple[float, str]:
+        """Return the factor from a unit of the model to the one that is shown, and the name of that."""
+        other = (DEGREES if self.degrees else {}) | (CENTIMETRES if self.centimetres else {})
+        name, factor = other.get(unit, (unit, 1.0))
+        return factor, name
+
+    def format(self, value: float, unit: str) -> str:
+        """Format a number that is given in a unit of the model."""
+        factor, name = self.scale(unit)
+        return f"{format_significant(factor * value)} {name}".rstrip()
+
+
 def choose_slider_range(
     limits: tuple[float, float], value: float, unit: str, beyond: float = 0.0
 ) -> tuple[float, float]:
@@ -112,67 +134,10 @@ def choose_slider_step(limits: tuple[float, float]) -> float:
     return float(10.0 ** np.floor(np.log10(max(limits[1] - limits[0], 1e-6) / 999.0)))
 
 
-DIFFERENCE_STEP = 1e-4  # step of the finite differences; their error is its square [unit of the coordinate]
-
-UNIT_TOLERANCE = 1e-5
-
-PROBE_DISTANCES = (0.0, 1.0, -1.0, 0.1, -0.1)
-"""Distances of the probed states from the given values; the later ones are used if earlier ones fail."""
-
-
 def on_input(control: Any, call: Callable[[Any], object]) -> None:
     """Have a call with the value of a control whenever a browser sets it."""
     # Values set by this program come back as events without a client.
     control.on_update(lambda event: call(event.target.value) if event.client is not None else None)
-
-
-def infer_units(model: ModelView, values: Mapping[str, float], names: Iterable[str]) -> dict[str, str]:
-    """Return ``"rad"``, ``"m"`` or ``""`` for each of the named symbols."""
-    wanted = list(names)
-    # In terms of free coordinates: the angles of a closed loop follow its crank.
-    moving = [t for frame in model.frames.values() if (t := model.rates.carry(frame.transform)).symbols]
-    if not moving:
-        return dict.fromkeys(wanted, "")
-    function = kv.compile(moving)
-    inputs = [str(symbol) for symbol in function.inputs]
-    base = np.array([values[name] for name in inputs])
-
-    def rates(place: Floats, index: int) -> tuple[Floats, Floats]:
-        offset = np.zeros(len(inputs))
-        offset[index] = DIFFERENCE_STEP
-        with np.errstate(invalid="ignore"):  # Frames without a finite pose have no rates.
-            return _rates(np.array(function(place - offset)), np.array(function(place + offset)))
-
-    found = dict.fromkeys(wanted, "")
-    # A second state excludes coordinates that move by one radian a unit only by chance.
-    off = 0.1 + 0.01 * np.arange(len(base))
-    for name in wanted:
-        if name not in inputs:
-            continue
-        seen = []
-        for distance in PROBE_DISTANCES:
-            # Loops do not close everywhere; two states are enough.
-            with suppress(NoSolutionError):
-                seen.append(rates(base + distance * off, inputs.index(name)))
-            if len(seen) == 2:
-                break
-        if len(seen) < 2:
-            continue
-        turning = np.all([np.abs(turn - 1.0) < UNIT_TOLERANCE for turn, _ in seen], axis=0)
-        shifting = np.all(
-            [(turn < UNIT_TOLERANCE) & (np.abs(s - 1.0) < UNIT_TOLERANCE) for turn, s in seen], axis=0
-        )
-        found[name] = "rad" if turning.any() else "m" if shifting.any() else ""
-    return found
-
-
-def _rates(before: Floats, after: Floats) -> tuple[Floats, Floats]:
-    """Return the (N,) rates of rotation [rad] and translation [m] a unit, from poses two steps apart."""
-    # The antisymmetric part of R_before' R_after has the norm √2 |sin| of the angle between them.
-    change = np.einsum("nji,njk->nik", before[:, :3, :3], after[:, :3, :3])
-    sine = np.linalg.norm(change - np.swapaxes(change, 1, 2), axis=(1, 2)) / np.sqrt(8.0)
-    shift = np.linalg.norm(after[:, :3, 3] - before[:, :3, 3], axis=1)
-    return np.asarray(sine / (2.0 * DIFFERENCE_STEP)), np.asarray(shift / (2.0 * DIFFERENCE_STEP))
 
 
 ANGLES = ("roll", "pitch", "yaw")

@@ -9,8 +9,9 @@ import time
 from collections.abc import Iterable, Mapping
 from typing import Any
 
+from kineverse._rich_display import Html
 from kineverse.errors import InvalidValueError, KineverseError, UnknownNameError, suggest
-from kineverse.model.constraint import Constraint
+from kineverse.model.kinematics import infer_units
 from kineverse.model.model import Model
 from kineverse.model.model_view import ModelView
 from kineverse.planning.trajectories.trajectory import Trajectory
@@ -19,20 +20,21 @@ from kineverse.state import State, StateLike
 from . import server as web
 from .animation import PlaybackLayer, RangeAnimation, TrajectoryPlayback, VelocityDrive, select_animated
 from .camera import Camera
+from .dragging import FrameDrag
 from .drawables import Drawable
-from .html import Html, element, format_failure, format_violations
+from .html import format_failure, format_violations
+from .notebook import bundle_display, is_in_notebook
 from .page import choose_title
 from .panel import Panel
 from .poses import complete, keep_known
 from .proximity_panel import ProximityPanel
 from .scene import ViewerScene
-from .sliders import QuaternionAngles, Ranges, infer_units
+from .sliders import DisplayUnits, QuaternionAngles, Ranges
 from .triangle_mesh import Floats
 
 logger = logging.getLogger(__name__)
 
 PERIOD = 1.0 / 30.0  # least time between two updates of the page [s]; requests in between are drawn together
-EMBEDDED_HEIGHT = 600  # height of the page in a notebook [pixels]
 PANEL_WIDTH = 380  # width of the controls: room for the names of joints [pixels]
 
 
@@ -71,7 +73,10 @@ class Viewer:
         self._animation: RangeAnimation | TrajectoryPlayback | None = None
         self._playback: TrajectoryPlayback | None = None
         self._drawn = 0.0
-        self._server = web.start(port, label or choose_title(model), host)
+        self._camera = camera
+        self._display = DisplayUnits(degrees=degrees)
+        # A saved notebook must not show whatever has its port later.
+        self._server = web.start(port, label or choose_title(model), host, secret=is_in_notebook())
         try:
             self._server.gui.configure_theme(
                 show_logo=False, show_share_button=False, brand_color=(34, 104, 172)
@@ -80,7 +85,10 @@ class Viewer:
             self._server.gui.main_panel.set_width(PANEL_WIDTH)
             self._scene = ViewerScene(self._server, self._shown, self._values, camera)
             self.collisions = ProximityPanel(self._server, self._scene, model, self._values)
-            self._panel = self._build_panel(degrees)
+            self._drag = FrameDrag(
+                self._server, self._scene, self._shown, self._display, on_change=self._drag_moved
+            )
+            self._panel = self._build_panel()
         except BaseException:
             web.stop(self._server)
             raise
@@ -122,6 +130,7 @@ class Viewer:
     def hide_sliders(self) -> None:
         """Show neither sliders nor the report of constraints: something else moves the model."""
         self._is_driven = True
+        self._drag.choose(None)
         self.refresh()
 
     def show_overlay(self, items: Iterable[Drawable]) -> None:
@@ -265,12 +274,12 @@ class Viewer:
     def __repr__(self) -> str:
         return f"<page of {self.model!r}, {'taken down' if self._stopping else self.address}>"
 
-    def _repr_html_(self) -> str:
-        if self._stopping:
-            return str(element("i", "This page has been taken down."))
-        return str(
-            element("iframe", src=self.address, width="100%", height=EMBEDDED_HEIGHT, style="border:none")
-        )
+    def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> dict[str, Any]:
+        model = _freeze(self.model)
+        values = complete(model, keep_known(model, self.values))
+        address = "" if self._stopping else self.address
+        note = "This page has been taken down." if self._stopping else ""
+        return bundle_display(repr(self), model, values, self._camera, address=address, note=note)
 
     def __enter__(self) -> Viewer:
         return self
@@ -278,7 +287,7 @@ class Viewer:
     def __exit__(self, *_: object) -> None:
         self.stop()
 
-    def _build_panel(self, degrees: bool) -> Panel:
+    def _build_panel(self) -> Panel:
         self._ranges = Ranges(self._shown)
         self._quaternions = QuaternionAngles(self._shown, self._values)
         self._drive = VelocityDrive(self._shown)
@@ -293,12 +302,13 @@ class Viewer:
             self._drive,
             self._units,
             self._values,
+            self._drag,
             on_move=self._set_from_slider,
             on_drive=lambda name, speed: self.drive({name: speed}),
             on_reset=self.reset,
             on_play=self.play,
             on_convert=self._request_redraw,
-            degrees=degrees,
+            display=self._display,
             sliders=not self._is_driven,
         )
 
@@ -327,6 +337,15 @@ class Viewer:
         self._driven.update(set_by_program)
         self._change.notify_all()
 
+    def _drag_moved(self) -> None:
+        """Let the model follow the gizmo, and nothing else."""
+        with self._change:
+            if self._animation is not None or self._drive.running:
+                self._stop_animation()
+                self._drive.stop()
+                self._panel.playing.value = False
+            self._request_update()
+
     def _request_redraw(self) -> None:
         with self._change:
             self._request_update()
@@ -338,6 +357,8 @@ class Viewer:
                 self._change.wait_for(self._has_work)
                 if self._stopping:
                     return
+            self._drag.prepare()
+            with self._change:
                 self._animate(time.monotonic())
                 asked, edited, self._edited = self._asked, self._edited, False
                 values, driven, self._driven = dict(self._values), self._driven, set()
@@ -349,7 +370,7 @@ class Viewer:
                 self._change.wait_for(lambda: self._stopping, timeout=PERIOD)
 
     def _has_work(self) -> bool:
-        running = self._animation is not None or self._drive.running
+        running = self._animation is not None or self._drive.running or self._drag.pending
         return self._stopping or self._asked > self._done or running
 
     def _animate(self, now: float) -> None:
@@ -366,6 +387,11 @@ class Viewer:
                 self._stop_animation()
         if self._drive.running:
             moved = self._drive.step(self._values, now - self._drawn)
+            self._values.update(moved)
+            self._driven.update(moved)
+            self._quaternions.update(self._values)
+        if self._drag.pending:
+            moved = self._drag.step(self._values)
             self._values.update(moved)
             self._driven.update(moved)
             self._quaternions.update(self._values)
@@ -387,8 +413,9 @@ class Viewer:
                 self._playback.remove()
                 self._playback = None
         self._scene.refresh(model, current)
+        self._drag.refresh(model)
         self._panel.remove()
-        self._panel = self._build_panel(self._panel.degrees)
+        self._panel = self._build_panel()
         return current
 
     def _draw(self, values: Mapping[str, float], driven: Iterable[str], edited: bool) -> None:
@@ -398,6 +425,7 @@ class Viewer:
                 values = self._rebuild()
             self._panel.update(values, driven)
             self._scene.update(values)
+            self._drag.follow()
             self.collisions.worker.update(values, edited)
             if self.unplaced:
                 self._panel.show(format_failure(f"Not finite, and hidden: {', '.join(self.unplaced)}."))
@@ -407,8 +435,8 @@ class Viewer:
                 return
             # An empty mapping would lack values; an empty state is that of a model without symbols.
             violated = self._shown.violations(State(values))
-            lone = {v.name: _find_lone_symbol(self._shown.constraints.get(v.name)) for v in violated}
-            scales = {name: self._panel.scale(symbol) for name, symbol in lone.items() if symbol}
+            known = {v.name: self._shown.constraints.get(v.name) for v in violated}
+            scales = {name: self._panel.scale_constraint(c) for name, c in known.items() if c is not None}
             self._panel.show(format_violations(violated, violated.unchecked, scales))
         except KineverseError as error:
             self._panel.show(format_failure(str(error)))
@@ -426,14 +454,6 @@ class Viewer:
             except Exception:
                 # The thread survives: the layer may be removed meanwhile.
                 logger.exception("the layer of the trajectory could not be updated")
-
-
-def _find_lone_symbol(constraint: Constraint | None) -> str:
-    """Return the name of the symbol that a constraint bounds; empty if it bounds anything else."""
-    if constraint is None or len(constraint.expression.symbols) != 1:
-        return ""
-    (symbol,) = constraint.expression.symbols
-    return str(symbol) if bool(constraint.expression == symbol) else ""
 
 
 def _freeze(model: ModelView) -> ModelView:

@@ -14,7 +14,7 @@ import numpy as np
 
 from kineverse._checks import as_positive
 from kineverse.lie import Array
-from kineverse.model.model_view import ModelView
+from kineverse.model.model_view import ModelView, find_symbols
 from kineverse.state import State, StateLike, as_state
 from kineverse.symbols import Symbol
 
@@ -57,7 +57,8 @@ class MechanismWorld:
     def __init__(self, model: ModelView, jammed: Collection[Symbol | str] = ()) -> None:
         self.model, self.robot = model, Robot.of_mechanism(model)
         self._symbols, self._columns = model.symbols, model.speeds
-        self.jammed = frozenset(model.degree_of_freedom(name) for name in jammed)
+        names = find_symbols(model, jammed, "jammed=")
+        self.jammed = frozenset(model.degree_of_freedom(s) for s in names)
         self._integrate = model.integrator()
         self._checker = model.constraint_checker((*self._symbols, *self._columns))
         orders = [model.constraints[n].order if n in model.constraints else 0 for n in self._checker.names]

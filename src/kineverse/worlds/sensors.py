@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from kineverse._checks import check_flag, finite_number
+from kineverse._names import match_names
 from kineverse.errors import DuplicateNameError, InvalidValueError, UnknownNameError, suggest
 from kineverse.lie import Array
 from kineverse.model.frame import WORLD
@@ -148,10 +149,9 @@ class Sensors:
         camera = self.camera or robot.camera or next(iter(robot.frames), WORLD)
         marked = robot.markers if self.marked is None else self.marked
         frames = robot.model.frames
-        for name in (camera, *marked, *sorted(self.hidden)):
-            if name not in frames and name != WORLD:
-                raise UnknownNameError(f"There is no frame '{name}'. {suggest(name, frames, 'frame')}")
-        return camera, marked
+        known = [*frames, WORLD]
+        match_names((camera, *sorted(self.hidden)), known, "frame")
+        return camera, match_names(marked, known, "frame")
 
     def position_noise(self, distance: Array) -> Array:
         """Return the standard deviation of each coordinate at distances (...) from the camera [m]."""

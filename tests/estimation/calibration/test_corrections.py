@@ -150,7 +150,7 @@ def test_parameters_are_replaced_in_nested_fields() -> None:
 BAD = [
     ("offset", kv.errors.InvalidValueError, "'offset PATTERN'"),
     ("ofset a", kv.errors.UnknownNameError, "Did you mean 'offset'"),
-    ("offset z*", kv.errors.UnknownNameError, "Nothing is named 'z\\*'"),
+    ("offset z*", kv.errors.UnknownNameError, "No joint matches 'z\\*'"),
     ("mount camra", kv.errors.UnknownNameError, "Did you mean 'camera'"),
     ("offset d", kv.errors.InvalidValueError, "'d' has no offset .* joints with one axis"),
     ("pitch a", kv.errors.InvalidValueError, "it is for screws"),

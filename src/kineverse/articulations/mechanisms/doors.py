@@ -31,12 +31,12 @@ class FoldingDoor(Mechanism, document_kind="FoldingDoor"):
     upper panel rotates about A by the coordinate ``name``, q [rad], 0 when shut. The directions along it and
     outward of it are e1 = (-sin q, -cos q) and e2 = (-cos q, sin q), those of the lower panel f1 and
     f2 = (f1z, -f1x). A point (u, v) of a panel is u along and v outward. With points of the upper panel from
-    A, and of the lower one from the hinge B between them,
+    A, and of the lower one from the hinge B between them::
 
         B = A + (e1, e2)·panel_hinge,      C = B + (f1, f2)·arm_end,      |C - D| = arm
 
     C is the intersection of two circles, about B and about D. With ``c = |arm_end|``, ``d = |D - B|`` and
-    w = (D - B)/d:
+    w = (D - B)/d::
 
         C - B = m w + h (w_z, -w_x),       m = (c² + d² - arm²)/2d,       h = √(c² - m²)
 
@@ -44,7 +44,7 @@ class FoldingDoor(Mechanism, document_kind="FoldingDoor"):
     panel from inside, so h is positive, and the panels hang one below the other at q = 0.
 
     A spring opens the door beyond the angle ``tipping`` and shuts it before. Together with the weight of the
-    panels it exerts on the upper panel the torque
+    panels it exerts on the upper panel the torque::
 
         τ = stiffness (q - tipping)      [N m],
 
@@ -224,7 +224,7 @@ def _on(point: Point) -> Pose:
 class GarageDoor(Mechanism, document_kind="GarageDoor"):
     """Garage door: the lower edge moves along a vertical rail, the upper edge along one under the ceiling.
 
-    2022 paper, Eqs. 11-13. With the length l and the angle α, 0 when closed,
+    2022 paper, Eqs. 11-13. With the length l and the angle α, 0 when closed::
 
         base_T_door = translation(0, 0, l (1 - cos α)) · rotation_y(α)
 

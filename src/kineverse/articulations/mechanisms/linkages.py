@@ -35,7 +35,7 @@ HALF_TURN = Pose((1.0, 0.0, 0.0, 0.0, 0.0, -1.0, 0.0, 0.0, 0.0, 0.0, -1.0, 0.0))
 class ScissorLift(Mechanism, document_kind="ScissorLift"):
     """Scissor lift: a platform on n pairs of crossed arms, one on top of the other.
 
-    The coordinate ``name`` is the angle q of the arms above the horizontal [rad]. With arms of length L,
+    The coordinate ``name`` is the angle q of the arms above the horizontal [rad]. With arms of length L::
 
         slider at L cos q,      crossing i = 1 … n at (L/2 cos q, L (i - ½) sin q),      height n L sin q
 
@@ -118,7 +118,7 @@ class DeskLamp(Mechanism, document_kind="DeskLamp"):
     """Desk lamp on two parallelograms, which keep the orientation of its head.
 
     The lower arm leans by α from the vertical and the upper one rises by β from the horizontal. Each has a
-    parallel bar of the same length, so elbow and head do not rotate:
+    parallel bar of the same length, so elbow and head do not rotate::
 
         base_T_elbow = translation(L₁ sin α, 0, L₁ cos α)
         base_T_head  = base_T_elbow · translation(L₂ cos β, 0, L₂ sin β)
@@ -212,7 +212,7 @@ class DeskLamp(Mechanism, document_kind="DeskLamp"):
 class PistonAndRod(Mechanism, document_kind="PistonAndRod"):
     """Slider-crank: a crank moves a piston by a rod, over the whole revolution.
 
-    With the angle of the crank ``name``, q [rad], its radius r and the length l > r of the rod:
+    With the angle of the crank ``name``, q [rad], its radius r and the length l > r of the rod::
 
         base_T_crank  = rotation_y(q)                                       (the pin is at r along z)
         base_T_piston = translation(0, 0, r cos q + √(l² - r² sin² q))
@@ -300,7 +300,7 @@ class PedalBin(Mechanism, document_kind="PedalBin"):
     under the bin, and a guided rod slides straight up. The rod has a horizontal slot at either end. In the
     lower one is a pin of the pedal, at distance a from its pivot, which lifts the rod by a sin p. In the
     upper one is a pin of the lid, at distance b from its hinge, which the rod lifts by b sin l, where l is
-    the angle of the lid:
+    the angle of the lid::
 
         l = arcsin(a/b sin p)
 

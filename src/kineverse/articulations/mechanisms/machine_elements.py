@@ -23,7 +23,7 @@ from .mechanism import DARK, RED, STEEL, YELLOW, Mechanism, MechanismPart, box_s
 class ScrewAndNut(Mechanism, document_kind="ScrewAndNut"):
     """Screw that rotates in a fixed place, and a nut that slides along it without rotation.
 
-    With the angle of the screw ``name``, q [rad], its pitch p and the travel t of the nut:
+    With the angle of the screw ``name``, q [rad], its pitch p and the travel t of the nut::
 
         base_T_screw = rotation_z(q),       base_T_nut = translation(0, 0, s)
         s = t - p q/2π  for p > 0,          s = -p q/2π  for p < 0
@@ -194,6 +194,8 @@ class Ratchet(Mechanism, document_kind="Ratchet"):
 @dataclass(frozen=True, kw_only=True)
 class Faucet(Mechanism, document_kind="Faucet"):
     """Mixer tap: the lever is lifted for more water and turned for warmer water.
+
+    With the lift l and the turn t::
 
         base_T_lever = translation(0, 0, height) · rotation_z(t) · rotation_y(l)
 

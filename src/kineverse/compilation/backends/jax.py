@@ -62,7 +62,7 @@ def to_jax(
     -------
     callable
         A function of an array of shape (..., n), the n inputs along its last axis. It returns arrays of
-        shape (..., *shape) for an expression of some shape, of the argument's type: float32 or float64.
+        shape ``(..., *shape)`` for an expression of some shape, of the argument's type: float32 or float64.
         Whole numbers count as ``float``. On a CPU float32 is computed in float64. Where a loop does not
         close, results are NaN, and no error is raised.
 

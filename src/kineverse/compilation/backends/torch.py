@@ -52,7 +52,7 @@ def to_torch(
     -------
     callable
         A function of a tensor of shape (..., n), the n inputs along its last dimension. It returns tensors of
-        shape (..., *shape) for an expression of some shape, of the argument's type: float32 or float64.
+        shape ``(..., *shape)`` for an expression of some shape, of the argument's type: float32 or float64.
         Whole numbers count as the default type. On the CPU float32 is computed in float64. Where a loop does
         not close, results are NaN, and no error is raised.
 

@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from kineverse._checks import as_count, as_positive
+from kineverse._rich_display import TableDisplay, element, html_table
 from kineverse.errors import DuplicateNameError, InvalidValueError, UnknownNameError, list_some, suggest
 from kineverse.estimation.noise import Outliers, as_outliers
 from kineverse.formats.saver import save_corrections
@@ -89,7 +90,7 @@ _PREPARED: WeakKeyDictionary[Model, tuple[int, dict[tuple[Any, ...], _Prepared]]
 
 
 @dataclass(frozen=True, eq=False)
-class Calibration:
+class Calibration(TableDisplay):
     """Result of :func:`calibrate`: parameters, their uncertainty, and the corrected operations.
 
     Attributes
@@ -221,6 +222,18 @@ class Calibration:
         lines += [f"not told by the data: {', '.join(alone)}"] if alone else []
         lines += [f"not told by the data: {format_direction(d)}" for d in self.unobservable if len(d) > 1]
         return "\n".join(lines)
+
+    def _repr_html_(self) -> str:
+        rows = [
+            (str(s), _format(value, self.deviations[str(s)], self.units[str(s)]))
+            for s, value in self.state.items()
+        ]
+        caption, *rest = str(self).splitlines()
+        return element(
+            "div",
+            html_table(caption, ("parameter", "value"), rows),
+            *(element("p", line) for line in rest[len(rows) :]),
+        )
 
 
 def format_direction(direction: Mapping[str, float]) -> str:

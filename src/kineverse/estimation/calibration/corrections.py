@@ -10,11 +10,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
-from fnmatch import fnmatchcase
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from kineverse._names import match_names
 from kineverse.articulations import Cylindrical, DifferentialDrive, Mecanum, Screw
 from kineverse.articulations.joint import Joint, OneAxisMotion, PlacedOperation, Size
 from kineverse.articulations.single_axis import rotation_factors, unit_axis
@@ -354,11 +354,8 @@ def _matching(model: Model, word: str, pattern: str) -> list[Correction]:
     tags = {name: _writer(model, "articulations", name) for name in model.articulations}
     if kinds == ("mount",) or kinds == ("length",):
         tags = {**{name: _writer(model, "frames", name) for name in model.frames}, **tags}
-    matching = {name: tag for name, tag in tags.items() if fnmatchcase(name, pattern)}
-    if not matching:
-        kind = "joints and frames" if kinds[0] in ("mount", "length") else "joints"
-        hint = suggest(pattern, tags, "such name")
-        raise UnknownNameError(f"Nothing is named '{pattern}' among the {kind}. {hint}")
+    noun = "joint or frame" if kinds[0] in ("mount", "length") else "joint"
+    matching = {name: tags[name] for name in match_names(pattern, tags, noun)}
     result: dict[str, Correction] = {}
     has_loops = any(isinstance(_inner(entry.operation), CloseLoop) for entry in model.history.sequence)
     for name, tag in matching.items():

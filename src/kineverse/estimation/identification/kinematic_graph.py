@@ -11,6 +11,7 @@ from typing import TypeVar
 import numpy as np
 import numpy.typing as npt
 
+from kineverse._rich_display import TableDisplay, html_table
 from kineverse.articulations import Fixed, Floating
 from kineverse.errors import DuplicateNameError, InvalidValueError, ModelError
 from kineverse.estimation.identification.curve import CURVE
@@ -392,7 +393,7 @@ class KinematicEdge:
 
 
 @dataclass(frozen=True)
-class KinematicGraph:
+class KinematicGraph(TableDisplay):
     """Rigid bodies and the joints between them.
 
     Attributes
@@ -487,6 +488,15 @@ class KinematicGraph:
         lines += [f"loop: {edge}" for edge in self.loops]
         lines += [f"{root} is connected to nothing" for root in self.roots[1:]]
         return "\n".join(lines)
+
+    def _repr_html_(self) -> str:
+        rows = [
+            (edge.parent, edge.child, str(edge.result), f"{edge.probability:.1%}", "loop" if closes else "")
+            for edges, closes in ((self.edges, False), (self.loops, True))
+            for edge in edges
+        ]
+        caption = f"{len(self.bodies)} bodies, {len(self.edges)} joints, {len(self.loops)} loops"
+        return html_table(caption, ("parent", "child", "joint", "connection", ""), rows)
 
 
 @singularity_named()

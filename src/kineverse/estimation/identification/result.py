@@ -10,6 +10,9 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 import numpy.typing as npt
 
+from kineverse._names import answer_foreign_names
+from kineverse._rich_display import Html, TableDisplay, element, html_table
+from kineverse._synonyms import IDENTIFICATION_SYNONYMS
 from kineverse.errors import InvalidValueError, UnknownNameError, suggest
 from kineverse.estimation.linear_algebra import invert_matrices, singularity_named
 from kineverse.estimation.noise import Outliers
@@ -36,7 +39,7 @@ class NoiseDeviations(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Fit:
+class Fit(TableDisplay):
     """Most likely member of one joint family.
 
     Attributes
@@ -193,6 +196,24 @@ class Fit:
             words.append(f"{size:.1f}°" if unit == "°" else f"{size:.3g} {unit}".rstrip())
         return ", ".join(words)
 
+    def _repr_html_(self) -> str:
+        rows = [(name, _format_numbers(value), self._spread(name)) for name, value in self.parameters.items()]
+        caption = f"{self}{'' if self.is_determined else f'; not determined: {self.reason}'}"
+        return html_table(caption, ("parameter", "value", "standard deviations"), rows)
+
+    def _spread(self, parameter: str) -> str:
+        """Return the standard deviations of the coordinates of a parameter, in their units."""
+        own = [name for name in self.coordinates if name.partition(".")[0] == parameter]
+        units = {"axis": "rad", "point": "m", "pitch": "m/revolution"}
+        unit = units.get(parameter, "")
+        return ", ".join(f"{name}: {self.deviation(name):.2g} {unit}".rstrip() for name in own)
+
+
+def _format_numbers(value: Array | float) -> str:
+    if np.ndim(value) < 2:
+        return ", ".join(f"{number:.5g}" for number in np.ravel(value))
+    return f"array of {' × '.join(map(str, np.shape(value)))}"
+
 
 class LazyFit(NamedTuple):
     """Family with its probability, and the function that computes its fit on first access."""
@@ -202,8 +223,9 @@ class LazyFit(NamedTuple):
     compute: Callable[[], Fit]
 
 
+@answer_foreign_names("An identification", IDENTIFICATION_SYNONYMS)
 @dataclass(frozen=True, eq=False)
-class IdentificationResult:
+class IdentificationResult(TableDisplay):
     """Fits of all families, the most probable first, each computed on first access.
 
     Attributes
@@ -271,6 +293,11 @@ class IdentificationResult:
         likely = {name: p for name, p in self.probabilities.items() if p > 1.0 - SURE}
         words = "cannot tell: " + " or ".join(f"{name} ({p:.0%})" for name, p in likely.items())
         return f"{words}, but {self.reason}" if self.reason else words
+
+    def _repr_html_(self) -> str:
+        rows = [(name, f"{probability:.2%}") for name, probability in self.probabilities.items()]
+        families = html_table(str(self), ("family", "probability"), rows)
+        return element("div", families, Html(self.best._repr_html_()))
 
     @singularity_named()
     def _fit(self, k: int) -> Fit:

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from kineverse._names import match_names
 from kineverse.errors import InvalidValueError, KineverseError, ShapeError, UnknownNameError, suggest
 from kineverse.estimation.correlation import CorrelationSettings, ErrorCorrelation
 from kineverse.estimation.identification import native
@@ -266,7 +267,7 @@ class PlausibilityMonitor:
     Parameters
     ----------
     frames
-        Names of the frames that may be observed.
+        Names of the frames that may be observed, or patterns.
     noise, relative_to, families, false_alarms, outliers, decorrelation_time, repaired
         As in :func:`~kineverse.estimation.check_plausibility`.
     keep
@@ -298,7 +299,7 @@ class PlausibilityMonitor:
         keep: int = 500,
     ) -> None:
         self.model = model
-        self.frames = tuple(dict.fromkeys(frames))
+        self.frames = match_names(frames, [*model.frames, WORLD], "frame", "frames=")
         self.count, self.false_alarms = 0, false_alarms
         correlation = CorrelationSettings(decorrelation_time, False)
         self._settings = TestSettings(false_alarms, as_outliers(outliers), relative_to, families, correlation)

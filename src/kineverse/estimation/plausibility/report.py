@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
+from kineverse._names import match_names
 from kineverse.errors import ModelError, UnknownNameError, suggest
 from kineverse.estimation.identification.result import SURE, IdentificationResult
 from kineverse.expressions.expression import Expression
@@ -37,11 +38,10 @@ class TestableJoints:
 
 def find_testable_joints(model: Model, observed: Iterable[str], relative_to: str | None) -> TestableJoints:
     """Find the joints that observed frames can test."""
-    names = list(dict.fromkeys(observed))
-    for name in names if relative_to is None else [*names, relative_to]:
-        if name != WORLD and name not in model.frames:
-            hint = suggest(name, [*model.frames, WORLD], "frame")
-            raise UnknownNameError(f"There is no frame {name!r}. {hint}")
+    known = [*model.frames, WORLD]
+    names = list(match_names(observed, known, "frame"))
+    if relative_to is not None:
+        match_names(relative_to, known, "frame", "relative_to=")
 
     def chain(name: str) -> list[str]:
         return [*ancestors(name, model.frames.__getitem__), WORLD]

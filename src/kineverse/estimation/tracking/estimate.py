@@ -10,6 +10,9 @@ from types import MappingProxyType
 import numpy as np
 import numpy.typing as npt
 
+from kineverse._names import answer_foreign_names
+from kineverse._rich_display import html_table
+from kineverse._synonyms import ESTIMATE_SYNONYMS
 from kineverse.compilation import compile
 from kineverse.estimation.linear_algebra import inverse_spd
 from kineverse.lie import Array
@@ -124,6 +127,7 @@ class TrackerState:
     residuals: Callable[[], dict[str, Residual]] = dict  # of the last update
 
 
+@answer_foreign_names("An estimate", ESTIMATE_SYNONYMS)
 class Estimate:
     """MAP estimate of the state inside the limits, with its uncertainty.
 
@@ -287,6 +291,12 @@ class Estimate:
         at = "" if self.stamp is None else f" at {self.stamp:g} s"
         values = ", ".join(f"{s}={value:.4g}±{self.deviation[s]:.2g}" for s, value in self.state.items())
         return f"<Estimate{at}: {values}{', lost' if self.lost else ''}>"
+
+    def _repr_html_(self) -> str:
+        rows = [(str(s), f"{value:.4g}", f"{self.deviation[s]:.2g}") for s, value in self.state.items()]
+        at = "" if self.stamp is None else f" at {self.stamp:g} s"
+        caption = f"estimate{at}{', lost' if self.lost else ''}"
+        return html_table(caption, ("coordinate", "value", "standard deviation"), rows)
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,7 +14,9 @@ import numpy as np
 import numpy.typing as npt
 
 from kineverse._checks import as_count, as_tolerance, finite_number
+from kineverse._names import answer_foreign_names
 from kineverse._runtime import CallLock, one_at_a_time
+from kineverse._synonyms import TRACKER_SYNONYMS
 from kineverse.errors import InvalidValueError, UnknownNameError, suggest
 from kineverse.estimation.noise import Outliers, as_outliers
 from kineverse.lie import Array
@@ -43,6 +45,7 @@ if TYPE_CHECKING:
     from kineverse.model.model_view import ModelView
 
 
+@answer_foreign_names("A tracker", TRACKER_SYNONYMS)
 class Tracker:
     """Recursive MAP estimator of the coordinates of a model from observed frames.
 

@@ -9,8 +9,9 @@ from typing import Literal
 
 import numpy as np
 
+from kineverse._names import match_names
 from kineverse.articulations.multi_axis import orientation
-from kineverse.errors import UnknownNameError, list_some, suggest
+from kineverse.errors import list_some
 from kineverse.expressions.expression import Expression, as_expression
 from kineverse.expressions.substitution import apply_substitution
 from kineverse.formats.description import (
@@ -71,16 +72,9 @@ def sort_parents_first(model: ModelView) -> list[str]:
 
 
 def check_left_out_names(leave_out: Iterable[str], model: ModelView) -> frozenset[str]:
-    """Check that constraints or articulations of the given names exist, and return the names."""
-    names = [leave_out] if isinstance(leave_out, str) else list(leave_out)
-    known = {*model.constraints, *model.articulations, *map(str, model.rates)}
-    for name in names:
-        if name not in known:
-            raise UnknownNameError(
-                f"{name!r} cannot be left out: it is neither a constraint nor an articulation. "
-                f"{suggest(str(name), known, 'name')}"
-            )
-    return frozenset(names)
+    """Return the constraints, articulations and coordinates with rates of names or patterns."""
+    known = [*model.constraints, *model.articulations, *map(str, model.rates)]
+    return frozenset(match_names(leave_out, known, "constraint or articulation", "leave_out="))
 
 
 def check_rotation(link: LinkDescription, unsupported: UnsupportedFeatures) -> None:

@@ -8,12 +8,11 @@ import json
 import logging
 import math
 from dataclasses import asdict, dataclass, replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
 
-from kineverse.compilation.cache import ContentCache, private_subfolder
+from kineverse.compilation.cache_kinds import KINDS
 from kineverse.errors import FormatError, InvalidValueError
 from kineverse.geometry.mesh_files import Floats
 
@@ -139,12 +138,8 @@ class Decomposition:
             raise FormatError("This is not a decomposition.") from error
 
 
-DECOMPOSITIONS = ContentCache(
-    partial(private_subfolder, "decompositions"),
-    ".hulls",
-    256 * 2**20,
-    logging.getLogger("kineverse.geometry"),
-    "The decomposition %s %s and counts as absent.",
+DECOMPOSITIONS = KINDS["decompositions"].make_cache(
+    logging.getLogger("kineverse.geometry"), "The decomposition %s %s and counts as absent."
 )
 """The cache."""
 

@@ -192,6 +192,17 @@ class MotionReport:
         """All suspects."""
         return tuple(entry for report in self.all for entry in report.suspects)
 
+    def _repr_html_(self) -> str:
+        from kineverse._rich_display import html_table  # for start-up time
+
+        rows = [
+            (report.name or "at rest", entry.severity.replace("_", " "), entry.kind, entry.text, entry.advice)
+            for report in self.all
+            for entry in (*report.findings, *report.suspects, *report.cannot_say)
+        ]
+        caption = f"{len(self.findings)} findings, {len(self.suspects)} suspects"
+        return html_table(caption, ("coordinate", "", "kind", "what", "advice"), rows)
+
     def __getitem__(self, name: Symbol | str) -> CoordinateReport:
         """Return the report of a coordinate."""
         known = {report.name: report for report in self.coordinates}

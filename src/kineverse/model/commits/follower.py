@@ -18,17 +18,17 @@ from .listeners import Commit, CommitFilter
 
 _LOG = logging.getLogger(__name__)
 
-T = TypeVar("T")
+Built = TypeVar("Built")
 
 
 def follow(
     model: Model,
-    build: Callable[[Snapshot], T],
+    build: Callable[[Snapshot], Built],
     *,
     frames: Iterable[str] | None = None,
     symbols: Iterable[Symbol] | None = None,
     paths: Iterable[str] | None = None,
-) -> Follower[T]:
+) -> Follower[Built]:
     """Build a value from a model now, and anew in the background when what it reads has changed.
 
     For what is made once and used in a loop: a compiled function, a controller, a tracker, a scene. The value
@@ -76,7 +76,7 @@ def follow(
     return Follower(model, build, CommitFilter.of(paths, symbols, None, frames))
 
 
-class BuiltValue(NamedTuple, Generic[T]):
+class BuiltValue(NamedTuple, Generic[Built]):
     """Value with the version of the model that it was built from.
 
     See Also
@@ -84,11 +84,11 @@ class BuiltValue(NamedTuple, Generic[T]):
     kineverse.follow
     """
 
-    value: T
+    value: Built
     version: int
 
 
-class Follower(Closing, Generic[T]):
+class Follower(Closing, Generic[Built]):
     """Value that follows a model, from :func:`kineverse.follow`; :meth:`close` ends that.
 
     Attributes
@@ -103,10 +103,10 @@ class Follower(Closing, Generic[T]):
     kineverse.follow
     """
 
-    current: BuiltValue[T]
+    current: BuiltValue[Built]
     error: BaseException | None
 
-    def __init__(self, model: Model, build: Callable[[Snapshot], T], wanted: CommitFilter) -> None:
+    def __init__(self, model: Model, build: Callable[[Snapshot], Built], wanted: CommitFilter) -> None:
         self._model = model
         self._build = build
         self._filter = wanted
@@ -130,7 +130,7 @@ class Follower(Closing, Generic[T]):
             self._start()
 
     @property
-    def value(self) -> T:
+    def value(self) -> Built:
         """The value of the last build that succeeded."""
         return self.current.value
 

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from kineverse._checks import as_entries
+from kineverse._names import is_pattern, matches_pattern
 from kineverse._runtime import Closing
 from kineverse.errors import ExpressionError
 from kineverse.expressions.expression import Expression
@@ -37,6 +38,15 @@ class Commit:
     def _changed(self) -> dict[str, dict[str, Change]]:
         kinds = (FRAMES, RATES)
         return {kind: {c.name: c for c in self.diff.changes if c.kind == kind} for kind in kinds}
+
+    def match_frames(self, names: Iterable[str]) -> Iterator[str]:
+        """Yield frames by name, and for patterns all that match, before or after the commit."""
+        for name in names:
+            if is_pattern(name):
+                every = dict.fromkeys((*self._head[FRAMES], *self._changed[FRAMES]))
+                yield from (frame for frame in every if matches_pattern(frame, (name,)))
+            else:
+                yield name
 
     def find_pose_changes(self, frame: str) -> list[Change]:
         """Return the changes that give a frame other forward kinematics."""
@@ -162,7 +172,7 @@ class CommitFilter:
         if self.coordinates:
             found += commit.find_changes_about(self.coordinates)
         poses = []
-        for frame in self.frames or ():
+        for frame in commit.match_frames(self.frames or ()):
             moving = commit.find_pose_changes(frame)
             if moving:
                 poses.append(frame)

@@ -9,13 +9,13 @@ import threading
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path, PurePath
 from typing import Any, TypeVar
 
 import numpy as np
 
-from kineverse.compilation.cache import ContentCache, private_subfolder
+from kineverse.compilation.cache import ContentCache
+from kineverse.compilation.cache_kinds import KINDS
 from kineverse.errors import FormatError, InvalidValueError
 from kineverse.geometry.mesh_files import Floats
 from kineverse.geometry.objects import CollisionObject
@@ -96,10 +96,10 @@ def _name(items: Sequence[CollisionObject]) -> str:
     return f"{items[0].body}: {kind}" + (f" and {len(items) - 1} more" if len(items) > 1 else "")
 
 
-_OPEN, _LOG = partial(private_subfolder, "spheres"), logging.getLogger("kineverse.planning")
+_LOG = logging.getLogger("kineverse.planning")
 
-COVERS = ContentCache(_OPEN, ".spheres", 64 * 2**20, _LOG, "The sphere cover %s %s and counts as absent.")
-TREES = ContentCache(_OPEN, ".tree", 64 * 2**20, _LOG, "The sphere tree %s %s and counts as absent.")
+COVERS = KINDS["sphere_covers"].make_cache(_LOG, "The sphere cover %s %s and counts as absent.")
+TREES = KINDS["sphere_trees"].make_cache(_LOG, "The sphere tree %s %s and counts as absent.")
 """Covers and trees on the disk."""
 
 # Raise the number when the covers or trees of equal solids and settings change.

@@ -23,8 +23,12 @@ import numpy as np
 import numpy.typing as npt
 
 from kineverse._checks import finite_number
+from kineverse._names import answer_foreign_names
+from kineverse._rich_display import draw_curves, element, html_table, picture_element
+from kineverse._synonyms import TRAJECTORY_SYNONYMS
 from kineverse.errors import ExpressionError, FormatError, InvalidValueError, ShapeError
 from kineverse.expressions.expression import ExpressionLike
+from kineverse.expressions.printing import format_number
 from kineverse.formats.files import read_file, replace_file
 from kineverse.lie import Array
 from kineverse.model.model_view import ModelView
@@ -35,9 +39,11 @@ if TYPE_CHECKING:
     from kineverse.control import Controller
 
 _JUMP = 1e-6  # largest difference of positions [rad], [m] and velocities where two are joined
+_SAMPLES = 200  # number of points of a drawn curve: two pixels apart
 _GAIN, _WEIGHT = 5.0, 100.0  # gain [1/s] and weight of the goals of a follower
 
 
+@answer_foreign_names("A trajectory", TRAJECTORY_SYNONYMS)
 @dataclass(frozen=True, eq=False, repr=False)
 class Trajectory:
     """Motion of coordinates over time: knots with positions and velocities, and cubics between them.
@@ -287,6 +293,19 @@ class Trajectory:
         names = ", ".join(map(str, self.symbols[:4])) + (", ..." if len(self.symbols) > 4 else "")
         size = f"{len(self)} knots, {len(self.symbols)} coordinates"
         return f"<Trajectory: {self.duration:g} s, {size}: {names}>"
+
+    def _repr_html_(self) -> str:
+        names = [str(symbol) for symbol in self.symbols]
+        times = np.linspace(0.0, self.duration, _SAMPLES)
+        curves = draw_curves(times, self.positions_at(times), names)
+        rows = [
+            (name, *map(format_number, (*column[[0, -1]], column.min(), column.max(), np.abs(speed).max())))
+            for name, column, speed in zip(names, self.positions.T, self.velocities.T, strict=True)
+        ]
+        caption = f"trajectory of {self.duration:.3g} s, {len(self)} knots [rad], [m]"
+        header = ("coordinate", "begin", "end", "least", "largest", "largest speed")
+        table = html_table(caption, header, rows)
+        return element("div", *([] if curves is None else [picture_element(curves, caption)]), table)
 
     @property
     def _arrays(self) -> tuple[Array, Array, Array]:
