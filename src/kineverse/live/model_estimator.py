@@ -160,6 +160,21 @@ class ModelEstimator:
     ----------
     proposals
         What would be written, by tag.
+
+    Examples
+    --------
+    >>> truth = kv.load("shelf_door")
+    >>> model = kv.live.make_unknown_scene(truth, "shelf_door/door").model
+    >>> estimator = kv.live.ModelEstimator(model, ["shelf_door/door"])
+    >>> door, body = truth.fk("shelf_door/door"), truth.fk("shelf_door/body")
+    >>> for k in range(100):
+    ...     angle = 0.01 * max(0, k - 20)
+    ...     poses = {"shelf_door/door": door({"shelf_door/door": angle}), "shelf_door/body": body()}
+    ...     estimator.add(poses, k / 10)
+    ...     if k % 10 == 9:
+    ...         estimator.think()
+    >>> [(part.frame, part.state, part.family) for part in estimator.note().watched]
+    [('shelf_door/door', 'moves', 'revolute')]
     """
 
     def __init__(

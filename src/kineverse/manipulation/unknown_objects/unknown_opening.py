@@ -133,6 +133,10 @@ def open_unknown(
     UnknownNameError, InvalidValueError
         For frames that do not exist, a robot without a gripper, a handle that is none, or a wanted opening
         that is not positive.
+
+    See Also
+    --------
+    kineverse.manipulation.unknown_objects.forget_joint
     """
     check_flag("in_thread", in_thread)
     for name, value in (("way", way), ("turn", turn), ("seconds", seconds)):
