@@ -11,7 +11,7 @@ import kineverse as kv
 from kineverse.estimation import Fit, IdentificationResult, ObservedPose, Outliers, Tracker, identify
 from kineverse.model.frame import WORLD
 from kineverse.view.plots import AXIAL_FAMILIES
-from kineverse.view.triangle_mesh import Floats
+from kineverse.view.rendering.triangle_mesh import Floats
 
 from .gating import OutlierGate
 from .sensor import MarkerReadings, SensorModel

@@ -6,7 +6,7 @@ import numpy as np
 
 from kineverse.estimation import Fit
 from kineverse.view.plots import AXIAL_FAMILIES, axis_covariances
-from kineverse.view.triangle_mesh import Floats, TriangleMesh, normalize_rows
+from kineverse.view.rendering.triangle_mesh import Floats, TriangleMesh, normalize_rows
 
 MARKER, THICK = 0.18, 0.02
 """Length and thickness of a marker's axes [m]."""

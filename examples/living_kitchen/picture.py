@@ -8,8 +8,8 @@ import numpy as np
 import numpy.typing as npt
 
 from kineverse.model.frame import WORLD
-from kineverse.view.camera import Camera
 from kineverse.view.pictures import draw_picture, write_png
+from kineverse.view.rendering.camera import Camera
 
 from .scene import CAMERA, SceneDrawables, create_marks
 from .simulation import Simulation

@@ -10,7 +10,7 @@ import numpy as np
 from kineverse.model.model_view import ModelView
 from kineverse.view.drawables import Drawable, Rgba, collect_drawables
 from kineverse.view.poses import FramePoses
-from kineverse.view.triangle_mesh import Floats, concatenate_meshes
+from kineverse.view.rendering.triangle_mesh import Floats, concatenate_meshes
 
 LIGHT_TONE, DARK_TONE = (0.88, 0.93, 0.98), (0.38, 0.50, 0.64)
 """The colours of white and black parts of an estimate that do not move."""

@@ -8,9 +8,9 @@ import numpy as np
 
 from kineverse.model.frame import WORLD
 from kineverse.spatial import translation
-from kineverse.view.camera import Camera
 from kineverse.view.drawables import AXIS_COLORS, Drawable
-from kineverse.view.triangle_mesh import Floats, TriangleMesh
+from kineverse.view.rendering.camera import Camera
+from kineverse.view.rendering.triangle_mesh import Floats, TriangleMesh
 
 from . import marker_meshes as marks
 from .identify import DIRECTED_FAMILIES

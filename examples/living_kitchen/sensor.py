@@ -10,7 +10,7 @@ import numpy.typing as npt
 from kineverse.errors import InvalidValueError
 from kineverse.estimation import pose_covariance
 from kineverse.lie import retract
-from kineverse.view.triangle_mesh import Floats
+from kineverse.view.rendering.triangle_mesh import Floats
 
 ORIENTATION_RATIO = np.radians(1.0) / 0.01
 """Ratio of the orientation's standard deviation to the position's: 1° a centimetre [rad/m]."""

@@ -12,7 +12,7 @@ import numpy as np
 import kineverse as kv
 from kineverse.estimation import Estimate, ObservedPose, Tracker
 from kineverse.model.model_view import ModelView
-from kineverse.view.triangle_mesh import Floats
+from kineverse.view.rendering.triangle_mesh import Floats
 
 from .sensor import MarkerReadings, SensorModel
 

@@ -25,7 +25,7 @@ from kineverse.model.basic_operations import SetBody
 from kineverse.model.body import Body, Pose, Rgba, Shape, Vector3
 from kineverse.model.frame import WORLD
 from kineverse.spatial import rotation_z, translation
-from kineverse.view.triangle_mesh import Floats
+from kineverse.view.rendering.triangle_mesh import Floats
 
 BASE, PART, HIDDEN = "stranger/base", "stranger/part", "stranger/hidden"
 """The observed frames, and the name of the hidden joint."""

@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from kineverse.view import lighting
+from kineverse.view.rendering import lighting
 from kineverse.view.drawables import Drawable, Rgba
 from kineverse.view.poses import to_wxyz
-from kineverse.view.triangle_mesh import Floats
+from kineverse.view.rendering.triangle_mesh import Floats
 
 from . import marker_meshes as marks
 from .placed_model import shade

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from kineverse.view import lighting
+from kineverse.view.rendering import lighting
 
 PATIENCE = 60_000
 """Longest wait for anything on the page [ms]: software rendering on a busy machine is slow."""

@@ -10,7 +10,7 @@ from small_models import cabinet, held_door
 
 from kineverse.view import Camera, view
 from kineverse.view.drawables import collect_drawables
-from kineverse.view.rasterizer import TriangleSoup
+from kineverse.view.rendering.rasterizer import TriangleSoup
 
 pytest.importorskip("viser", reason="the page needs the extra 'view'")
 

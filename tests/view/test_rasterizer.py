@@ -5,9 +5,9 @@ from hypothesis import strategies as st
 
 from kineverse.errors import InvalidValueError
 from kineverse.model.body import Box, Sphere
-from kineverse.view.camera import Camera, fit_camera
 from kineverse.view.meshes import mesh_geometry
-from kineverse.view.rasterizer import Projection, rasterize
+from kineverse.view.rendering.camera import Camera, fit_camera
+from kineverse.view.rendering.rasterizer import Projection, rasterize
 
 SEEDS = st.integers(0, 10_000)
 

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from kineverse.model.body import Box, Capsule, Cone, Cylinder, Ellipsoid, Sphere
 from kineverse.view.meshes import mesh_geometry
-from kineverse.view.triangle_mesh import build_creased_mesh, concatenate_meshes, mesh_placeholder
+from kineverse.view.rendering.triangle_mesh import build_creased_mesh, concatenate_meshes, mesh_placeholder
 
 LENGTH = st.floats(0.01, 3.0)
 PRIMITIVES = st.one_of(

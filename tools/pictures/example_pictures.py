@@ -22,12 +22,12 @@ import kineverse as kv
 from kineverse.lie import translation
 from kineverse.model.body import Body, Box, Capsule, Pose, Shape
 from kineverse.view import Camera, draw_finding, picture
-from kineverse.view.camera import fit_camera
 from kineverse.view.clips import ClipMoment, draw_clip
 from kineverse.view.drawables import TRACE, Drawable, build_spheres, draw_frame_path, draw_ghosts
 from kineverse.view.pictures import join_pictures
 from kineverse.view.plots import draw_fit
 from kineverse.view.proximity import build_arrow
+from kineverse.view.rendering.camera import fit_camera
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 SIZE = (480, 320)

@@ -6,7 +6,7 @@ import numpy as np
 
 import kineverse as kv
 from kineverse.view import picture
-from kineverse.view.camera import fit_camera
+from kineverse.view.rendering.camera import fit_camera
 
 AZIMUTH, ELEVATION = 0.35, 0.75
 SIZE = (157, 110)

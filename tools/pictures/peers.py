@@ -11,10 +11,10 @@ import numpy as np
 
 import kineverse as kv
 from kineverse.view import picture
-from kineverse.view.auto_camera import find_extreme_points
-from kineverse.view.camera import fit_camera
 from kineverse.view.drawables import TRACE, Drawable, build_spheres, collect_drawables, draw_ghosts
 from kineverse.view.poses import FramePoses, complete
+from kineverse.view.rendering.auto_camera import find_extreme_points
+from kineverse.view.rendering.camera import fit_camera
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 SIZE = (480, 320)

@@ -7,10 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 
 import kineverse as kv
-from kineverse.view.camera import Camera, fit_camera
 from kineverse.view.drawables import collect_drawables
 from kineverse.view.poses import FramePoses
-from kineverse.view.rasterizer import TriangleSoup
+from kineverse.view.rendering.camera import Camera, fit_camera
+from kineverse.view.rendering.rasterizer import TriangleSoup
 
 
 def fit_scene_camera(

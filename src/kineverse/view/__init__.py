@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 from kineverse._lazy import lazy_face
 
 if TYPE_CHECKING:
-    from .camera import Camera as Camera
+    from .rendering.camera import Camera as Camera
     from .finding_pictures import draw_finding as draw_finding
     from .page import show as show, view as view
     from .pictures import picture as picture, save_picture as save_picture

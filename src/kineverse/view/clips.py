@@ -20,13 +20,13 @@ from kineverse.model.model_view import ModelView
 from kineverse.state import StateLike
 
 from .animation import PERIOD, RangeAnimation, select_animated
-from .auto_camera import choose_camera_for_parts, find_extreme_points, reframe
-from .camera import Camera
 from .drawables import Drawable, collect_drawables
 from .pictures import CLIP_SUFFIXES, draw_picture
 from .poses import FramePoses, complete
+from .rendering.auto_camera import choose_camera_for_parts, find_extreme_points, reframe
+from .rendering.camera import Camera
+from .rendering.triangle_mesh import Floats
 from .sliders import Ranges
-from .triangle_mesh import Floats
 
 SIZE = (640, 480)  # [pixels]
 RATE = 12.5  # pictures per second
@@ -59,16 +59,8 @@ def draw_clip(
 ) -> Iterator[npt.NDArray[np.uint8]]:
     """Return pictures of a model, (height, width, 3) bytes each, from one camera and in one light.
 
-    Parameters
-    ----------
-    moments
-        The contents of the pictures.
-    size
-        Width and height in pixels.
-    camera
-        The camera; None for one that has all that moves in view.
-    collisions, decomposed
-        As those of :func:`kineverse.view.picture`.
+    Without a camera, one is chosen that has all that moves in view. Collisions are as those of
+    :func:`kineverse.view.picture`.
     """
     items = collect_drawables(model, "collision" if collisions else "visual", decomposed)
     frames = FramePoses(model)
@@ -113,23 +105,8 @@ def encode_clip(
 ) -> bytes:
     """Return the bytes of an animated WebP (suffix ``.webp``) or GIF (``.gif``) that is repeated for ever.
 
-    Parameters
-    ----------
-    pictures
-        Images of (height, width, 3) bytes, all of one size.
-    suffix
-        One of ``".webp"`` and ``".gif"``.
-    rate
-        Number of pictures per second.
-    **options
-        Options of Pillow's writer, such as ``quality``.
-
-    Raises
-    ------
-    MissingDependencyError
-        If Pillow is not installed.
-    ShapeError
-        If there is no picture, or if they differ in size.
+    Pictures are (height, width, 3) bytes, all of one size, ``rate`` of them a second. Options are those of
+    Pillow's writer, such as ``quality``. Without Pillow, this is a :class:`MissingDependencyError`.
     """
     try:
         pillow = importlib.import_module("PIL.Image")

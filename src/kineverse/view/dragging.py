@@ -28,9 +28,9 @@ from kineverse.symbols import Symbol
 
 from .html import FONT, Html, HtmlBox, element
 from .poses import to_wxyz
+from .rendering.triangle_mesh import Floats
 from .scene import ViewerScene
 from .sliders import DisplayUnits, on_input
-from .triangle_mesh import Floats
 
 logger = logging.getLogger(__name__)
 

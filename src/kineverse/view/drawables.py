@@ -25,7 +25,7 @@ from kineverse.state import State
 
 from .meshes import LoadedMesh, load_mesh, mesh_geometry
 from .poses import FramePoses, complete
-from .triangle_mesh import Floats, TriangleMesh, build_creased_mesh
+from .rendering.triangle_mesh import Floats, TriangleMesh, build_creased_mesh
 
 
 def load_hull(mesh: Mesh) -> LoadedMesh:

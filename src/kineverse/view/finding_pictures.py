@@ -15,10 +15,10 @@ from kineverse.errors import KineverseError
 from kineverse.geometry.motion_checks.report import MotionFinding, MotionReport
 from kineverse.model.model_view import ModelView
 
-from .auto_camera import choose_camera_for_parts
 from .drawables import Drawable, Rgba, collect_drawables
 from .pictures import draw_picture, write_png
 from .poses import FramePoses, complete
+from .rendering.auto_camera import choose_camera_for_parts
 
 SIZE = (640, 480)  # [pixels]
 

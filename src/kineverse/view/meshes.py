@@ -13,7 +13,7 @@ from kineverse.geometry.mesh_files import MeshFile, find_mesh_file, load_mesh_pa
 from kineverse.model.body import Geometry, Mesh
 from kineverse.model.model_view import ModelView
 
-from .triangle_mesh import (
+from .rendering.triangle_mesh import (
     Floats,
     TriangleMesh,
     build_creased_mesh,

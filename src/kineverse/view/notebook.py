@@ -19,9 +19,9 @@ from kineverse.errors import KineverseError
 from kineverse.model.model_view import ModelView
 from kineverse.state import StateLike
 
-from .camera import Camera
 from .pictures import encode_png, picture
 from .poses import complete, keep_known
+from .rendering.camera import Camera
 
 logger = logging.getLogger(__name__)
 

@@ -16,8 +16,8 @@ from kineverse.model.model_view import ModelView
 from kineverse.state import StateLike
 
 if TYPE_CHECKING:
-    from .camera import Camera
     from .notebook import ModelPicture  # for start-up time
+    from .rendering.camera import Camera
     from .viewer import Viewer
 
 

@@ -18,10 +18,12 @@ from kineverse.formats.files import replace_file
 from kineverse.model.model_view import ModelView
 from kineverse.state import StateLike
 
-from .auto_camera import choose_camera, weigh_drawables
-from .camera import Camera
 from .drawables import Drawable, collect_drawables, create_axes
-from .lighting import (
+from .poses import FramePoses, complete
+from .proximity import ProximityMarkers, ProximityQuery, create_marker_drawables
+from .rendering.auto_camera import choose_camera, weigh_drawables
+from .rendering.camera import Camera
+from .rendering.lighting import (
     DirectionalLight,
     compute_outlines,
     draw_background,
@@ -30,10 +32,8 @@ from .lighting import (
     to_display,
     to_linear,
 )
-from .poses import FramePoses, complete
-from .proximity import ProximityMarkers, ProximityQuery, create_marker_drawables
-from .rasterizer import Projection, TriangleSoup, rasterize
-from .triangle_mesh import Floats, Integers, Singles, dot_rows
+from .rendering.rasterizer import Projection, TriangleSoup, rasterize
+from .rendering.triangle_mesh import Floats, Integers, Singles, dot_rows
 
 
 def write_png(path: str | Path, pixels: npt.NDArray[np.uint8]) -> None:

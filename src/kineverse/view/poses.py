@@ -15,7 +15,7 @@ from kineverse.model.model_view import ModelView
 from kineverse.state import State, StateLike
 from kineverse.symbols import parse_symbol_name
 
-from .triangle_mesh import Floats
+from .rendering.triangle_mesh import Floats
 
 
 def to_wxyz(matrices: npt.ArrayLike) -> Floats:

@@ -22,7 +22,7 @@ from kineverse.state import State
 
 from .drawables import Drawable
 from .meshes import mesh_geometry
-from .triangle_mesh import Floats, TriangleMesh, mesh_placeholder
+from .rendering.triangle_mesh import Floats, TriangleMesh, mesh_placeholder
 
 RADIUS = 0.1  # default distance within which pairs are shown [m]
 MOST_PAIRS = 40  # most pairs that are shown; further ones are counted, not drawn

@@ -25,7 +25,7 @@ from .drawables import TRACE, Drawable, Rgba, build_spheres, collect_drawables
 from .html import BREAK, FONT, HtmlBox
 from .poses import FramePoses, complete, keep_known, to_wxyz
 from .proximity import build_arrow
-from .triangle_mesh import Floats
+from .rendering.triangle_mesh import Floats
 from .viewer import PERIOD, Viewer
 
 GHOST: Rgba = (0.16, 0.47, 0.86, 0.35)  # colour of the belief

@@ -12,13 +12,13 @@ import numpy.typing as npt
 
 from kineverse.model.model_view import ModelView
 
-from . import lighting
-from .auto_camera import ClientCameras, choose_camera, find_extreme_points, reframe, weigh_drawables
-from .camera import Camera
 from .drawables import Drawable, Kind, choose_axis_length, collect_drawables
 from .poses import FramePoses, to_wxyz
-from .rasterizer import Projection, TriangleSoup, rasterize
-from .triangle_mesh import Floats, TriangleMesh
+from .rendering import lighting
+from .rendering.auto_camera import ClientCameras, choose_camera, find_extreme_points, reframe, weigh_drawables
+from .rendering.camera import Camera
+from .rendering.rasterizer import Projection, TriangleSoup, rasterize
+from .rendering.triangle_mesh import Floats, TriangleMesh
 
 FIELD_OF_VIEW, ASPECT = 0.8, 1.25
 ROOT = "/model"

@@ -15,12 +15,12 @@ from kineverse.symbols import Symbol
 from kineverse.worlds import Robot
 from kineverse.worlds.robot_interface import SkillStep
 
-from .auto_camera import choose_camera_for_parts
 from .drawables import Drawable, collect_drawables
 from .pictures import draw_picture, join_pictures, write_png
 from .poses import FramePoses
+from .rendering.auto_camera import choose_camera_for_parts
+from .rendering.triangle_mesh import Floats
 from .run_overlay import RunDrawing, RunMoment
-from .triangle_mesh import Floats
 
 SIZE = (400, 300)  # size of a still [pixels]
 _MOVED, _ROBOT = 2.0, 1.0  # weights of the object and of the robot in the choice of a camera

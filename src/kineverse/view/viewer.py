@@ -19,7 +19,6 @@ from kineverse.state import State, StateLike
 
 from . import server as web
 from .animation import PlaybackLayer, RangeAnimation, TrajectoryPlayback, VelocityDrive, select_animated
-from .camera import Camera
 from .dragging import FrameDrag
 from .drawables import Drawable
 from .html import format_failure, format_violations
@@ -28,9 +27,10 @@ from .page import choose_title
 from .panel import Panel
 from .poses import complete, keep_known
 from .proximity_panel import ProximityPanel
+from .rendering.camera import Camera
+from .rendering.triangle_mesh import Floats
 from .scene import ViewerScene
 from .sliders import DisplayUnits, QuaternionAngles, Ranges
-from .triangle_mesh import Floats
 
 logger = logging.getLogger(__name__)
 

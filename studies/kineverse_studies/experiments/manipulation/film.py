@@ -13,13 +13,13 @@ import numpy.typing as npt
 from kineverse.lie import Array
 from kineverse.model.frame import WORLD
 from kineverse.model.model import Model
-from kineverse.view.camera import Camera, fit_camera
 from kineverse.view.drawables import Drawable, Rgba, build_spheres, collect_drawables
 from kineverse.view.pictures import picture
 from kineverse.view.plots import Figure
 from kineverse.view.poses import FramePoses, complete
 from kineverse.view.proximity import build_arrow
-from kineverse.view.rasterizer import Projection, TriangleSoup, rasterize
+from kineverse.view.rendering.camera import Camera, fit_camera
+from kineverse.view.rendering.rasterizer import Projection, TriangleSoup, rasterize
 
 from .trials import Moment
 
@@ -113,7 +113,7 @@ def choose_cameras(views: Sequence[RowView], aspect: float) -> list[Camera]:
         product(_ELEVATIONS, azimuths),
         key=lambda direction: sum(v.score(v.camera(direction, aspect), aspect) for v in views),
     )
-    return [view.camera(best, aspect) for view in views]
+    return [view.rendering.camera(best, aspect) for view in views]
 
 
 def _place(model: Model, items: Sequence[Drawable], values: Mapping[str, float]) -> TriangleSoup:

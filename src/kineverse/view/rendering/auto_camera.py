@@ -11,9 +11,9 @@ import numpy as np
 import numpy.typing as npt
 
 from kineverse.model.model_view import ModelView
+from kineverse.view.drawables import Drawable
 
 from .camera import Camera, fit_camera
-from .drawables import Drawable
 from .rasterizer import Projection, TriangleSoup, rasterize
 from .triangle_mesh import Floats
 

@@ -14,8 +14,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from kineverse.view.drawables import Drawable
+
 from .camera import Camera
-from .drawables import Drawable
 from .triangle_mesh import Floats, Integers
 
 FRAGMENTS = 1_500_000  # pixels handled at once: between numpy's overhead and the size of the caches

@@ -1,0 +1,1 @@
+"""Software renderer: triangles, camera, light and pixels, without a browser or a GPU."""
