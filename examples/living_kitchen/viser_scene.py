@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from kineverse.view.rendering import lighting
 from kineverse.view.drawables import Drawable, Rgba
 from kineverse.view.poses import to_wxyz
+from kineverse.view.rendering import lighting
 from kineverse.view.rendering.triangle_mesh import Floats
 
 from . import marker_meshes as marks
