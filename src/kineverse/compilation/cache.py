@@ -128,7 +128,8 @@ class ContentCache:
         with open(path, "rb") as file:
             end = self._end(file.read())
         self.folder.adopt(path, key + self._ending, end)
-        files = sorted(self._files())
+        # One that is larger than the limit is not kept, instead of all others.
+        files = sorted(self._files(), key=lambda file: (file[1] <= self.most_bytes, file))
         excess = sum(size for _, size, _ in files) - self.most_bytes
         for _, size, other in files:
             if excess <= 0:

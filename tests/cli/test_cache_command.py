@@ -192,6 +192,7 @@ def test_a_kind_that_reaches_its_limit_loses_what_was_not_used_for_the_longest_t
     cache.most_bytes = 2000
     try:
         cache.write("d", bytes(900))
+        cache.write("e", bytes(3000))  # never fits
     finally:
         cache.most_bytes = most
     assert sorted(cache.list_keys()) == ["a", "d"]
