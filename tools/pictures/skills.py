@@ -7,12 +7,12 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-from example_pictures import run_example
+from example_pictures import OPEN_FRIDGE, run_example
 from PIL import Image
 
 import kineverse as kv
 from kineverse.cli.command_line import main
-from kineverse.view import Camera, picture
+from kineverse.view import picture
 from kineverse.view.pictures import join_pictures
 
 SIZE = (480, 320)
@@ -55,8 +55,7 @@ def draw_shapes() -> np.ndarray:
 def draw_fetch() -> np.ndarray:
     """Return a Fetch that has opened a fridge by the controller of an example."""
     found = run_example("19_open_a_door", "--headless", "fetch")
-    eye = Camera((0.1, 2.2, 2.0), (0.75, -1.35, 0.85), field_of_view=0.5)
-    return picture(found["model"], found["state"], SIZE, eye)
+    return picture(found["model"], found["state"], SIZE, OPEN_FRIDGE)
 
 
 SKILL_PICTURES: dict[str, Callable[[], np.ndarray]] = {
