@@ -301,11 +301,13 @@ class ModelComparison:
     def _repr_html_(self) -> str:
         from kineverse._rich_display import html_table  # for start-up time
 
+        from .display import count_values
+
         rows = [
             (one.sign, one.change.path, ", ".join(part.what for part in one.parts))
             for one in self.differences
         ]
-        caption = f"{len(rows)} differences beyond {self.tolerance:g}"
+        caption = f"{count_values(len(rows), 'differences')} beyond {self.tolerance:g}"
         return html_table(caption, ("", "what", "parts"), rows)
 
     def __init__(self, before: Model, after: Model, tolerance: float, operations: str = "auto") -> None:
