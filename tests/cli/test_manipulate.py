@@ -14,6 +14,8 @@ from kineverse.manipulation.outcome import Outcome
 pytest.importorskip("coal")
 pytest.importorskip("daqp")
 
+pytestmark = pytest.mark.compiler  # without one, these commands refuse before all else
+
 ARM = """<robot name="arm">
   <link name="root"/>
   <link name="lift"/>
