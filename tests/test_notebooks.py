@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import tempfile
 from base64 import b64decode
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,11 +18,11 @@ import notebooks as tool
 
 PATHS = sorted(tool.FOLDER.glob("*.ipynb"))
 NEEDED = {
-    "01_first_model": ("viser",),
+    "01_first_model": ("viser", "zenoh"),
     "02_a_joint_of_your_own": ("viser",),
     "04_open_a_door": ("viser", "daqp"),
 }
-SLOW = ("04_open_a_door",)  # seconds of control
+SLOW = ("01_first_model", "04_open_a_door")  # seconds: pictures of kitchens, control
 
 LARGEST = 60_000  # bytes of a picture in the repository
 
@@ -30,7 +31,8 @@ LARGEST = 60_000  # bytes of a picture in the repository
 def kernel(tmp_path_factory: pytest.TempPathFactory) -> Iterator[object]:
     """One real kernel for all, with files of its own."""
     folder = tmp_path_factory.mktemp("jupyter")
-    with pytest.MonkeyPatch.context() as patch:
+    with pytest.MonkeyPatch.context() as patch, tempfile.TemporaryDirectory(prefix="kv-") as sockets:
+        patch.setenv("KINEVERSE_RUNTIME_DIR", sockets)
         for name in ("JUPYTER_RUNTIME_DIR", "JUPYTER_DATA_DIR", "JUPYTER_CONFIG_DIR", "IPYTHONDIR"):
             patch.setenv(name, str(folder / name.lower()[:9]))
         with tool.start_kernel() as running:

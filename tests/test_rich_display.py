@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html.parser
+import math
 import sys
 from collections.abc import Callable
 from typing import Any
@@ -15,9 +16,11 @@ from hypothesis import strategies as st
 import kineverse as kv
 from hypothesis_profiles import attempts
 from kineverse._rich_display import CELL, ROWS, draw_curves, element, folded, html_table
-from kineverse.estimation import identify, identify_graph, pose_covariance
+from kineverse.estimation import Calibration, Tracker, identify, identify_graph, pose_covariance
+from kineverse.geometry.motion_checks.report import CoordinateReport, MotionFinding, MotionReport
 from kineverse.model import compare_models
-from kineverse.planning import Trajectory
+from kineverse.model.comparison import ModelComparison
+from kineverse.planning import Path, Trajectory
 
 HOSTILE = "</td><script>alert(1)</script><img src=x onerror='alert(1)'>\"&amp;$"
 EMPTY = ("img", "br")
@@ -97,6 +100,8 @@ def hinge(angles: Any) -> Any:
 def displays() -> dict[str, Callable[[], str]]:
     model, s = model_with(HOSTILE), kv.position(HOSTILE)
     poses = {HOSTILE: np.tile(np.eye(4), (20, 1, 1)), "door": hinge(np.linspace(0, 1, 20))}
+    found = MotionFinding("crossed_limits", "finding", HOSTILE), MotionFinding("no_limits", "suspect", "none")
+    report = MotionReport((CoordinateReport(HOSTILE, found),), CoordinateReport(""))
     trajectory = Trajectory((s,), [0.0, 1.0, 2.0], [[0.0], [1.0], [0.5]], [[0.0], [1.0], [0.0]])
     return {
         "model": model._repr_html_,
@@ -106,14 +111,75 @@ def displays() -> dict[str, Callable[[], str]]:
         "diff": compare_models(kv.Model(), model)._repr_html_,
         "graph": identify_graph(poses, world=False, noise=pose_covariance(0.001, 0.01))._repr_html_,
         "trajectory": trajectory._repr_html_,
+        "path": Path(
+            True, (s,), np.array([[0.0], [1.0]]), "", 0.1, 0.1, 1, kv.State({s: 0}), None
+        )._repr_html_,
+        "no path": Path(False, (s,), np.zeros((0, 1)), HOSTILE, 0.1, 0.1, 1, kv.State({}), None)._repr_html_,
+        "comparison": ModelComparison(kv.Model(), model, 1e-6)._repr_html_,
+        "report": report._repr_html_,
+        "estimate": Tracker(model, [HOSTILE]).update({HOSTILE: np.eye(4)}, at=3.0)._repr_html_,
+        "calibration": calibration()._repr_html_,
     }
 
 
-@pytest.mark.parametrize("name", ["model", "state", "violations", "function", "diff", "graph", "trajectory"])
-def test_hostile_names_stay_text(name: str) -> None:
-    shown = displays()[name]()
-    check(shown)
-    assert "&lt;script&gt;" in shown
+def calibration() -> Calibration:
+    """Return a calibration with a parameter that the looks tell, and one that they do not."""
+    numbers = {HOSTILE: 0.01, "unseen": math.inf}
+    state = kv.State({kv.parameter(HOSTILE, 0.0): 0.25, kv.parameter("unseen", 0.0): 0.0})
+    return Calibration(
+        state, np.eye(2), numbers, ({"unseen": 1.0},), {"position": 0.002}, (), {"position": 0.1}, {}, 12,
+        {HOSTILE: "m", "unseen": "rad"}, {}, kv.Model(), (),
+    )  # fmt: skip
+
+
+def test_hostile_names_stay_text() -> None:
+    for name, display in displays().items():
+        shown = display()
+        check(shown)
+        assert "&lt;script&gt;" in shown, name
+
+
+def test_results_say_what_was_found() -> None:
+    cells = {name: check(display()).cells for name, display in displays().items()}
+    assert cells["report"][0] == "1 finding, 1 suspect"
+    assert cells["report"][6:11] == [HOSTILE, "finding", "crossed_limits", HOSTILE, "Swap the limits."]
+    assert cells["report"][12:14] == ["suspect", "no_limits"]
+    assert cells["estimate"][0] == "estimate at 3 s"
+    assert abs(float(cells["estimate"][cells["estimate"].index(HOSTILE) + 1])) < 0.001
+    assert cells["path"][0] == "path of 2 points, length 1, found in 100 ms"
+    assert cells["path"][-4:] == ["0", "1", "0", "1"]
+    assert HOSTILE in cells["no path"][0]
+    found = cells["calibration"]
+    assert found[0] == "Calibration of 2 parameters from 12 looks"
+    assert found[3:5] == [HOSTILE, "+250 ± 10 mm"]
+    assert found[-2:] == ["position: noise 2 mm, off by 100 mm before", "not told by the data: unseen"]
+    comparison = cells["comparison"]
+    assert comparison[0] == "5 differences beyond 1e-06"
+    assert comparison[comparison.index(f"frames/{HOSTILE}") - 1] == "+"
+
+
+def test_operations_that_differ_alone_are_in_the_comparison() -> None:
+    one, other = model_with("q"), model_with("q")
+    with one.edit() as edit:
+        edit.add_frame("twin", "world")
+    with other.edit() as edit:
+        edit.add_frame("twin", "world", tag="other")
+    comparison = ModelComparison(one, other, 1e-6, "yes")
+    assert not comparison.equal
+    cells = check(comparison._repr_html_()).cells
+    assert cells[0] == "0 differences beyond 1e-06"
+    assert "operation other" in cells
+
+
+def test_a_live_model_shows_where_it_is_kept_and_whether_it_is_there(sockets: object) -> None:
+    pytest.importorskip("zenoh")
+    with kv.exchange.serve(model_with(HOSTILE), name="display"):
+        model = kv.load("live:display")
+        shown = check(model._repr_html_())
+        assert shown.cells[0] == f"{model.exchange.address}: revision {model.version}, online"
+        assert "1 DoF" in shown.cells
+        model.close()
+        assert check(model._repr_html_()).cells[0].endswith(", closed")
 
 
 @settings(max_examples=attempts(100))
@@ -151,6 +217,7 @@ def test_a_model_shows_freedoms_with_units_frames_as_a_tree_and_constraints() ->
         "in door, moved by slide",
     ]
     assert {"2 DoF", "2 frames", "3 constraints", "2 articulations"} <= set(cells)
+    assert "1 frame" in check(model_with("q")._repr_html_()).cells
 
 
 def test_an_identification_shows_families_and_parameters() -> None:

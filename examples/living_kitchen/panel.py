@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from html import escape
 from typing import Any
-
-from kineverse._rich_display import Html, element, join_html
-from kineverse.view.html import BREAK, HtmlBox
 
 from .identify import FamilyProbabilities
 from .report import tabulate_identification, tabulate_tracking
@@ -32,16 +30,11 @@ COLORS = {
 WIDTH, HEIGHT, SHOWN = 300, 64, 40
 """Size of the plot of probabilities [pixels], and the number of identifications it shows."""
 
-INTRODUCTION = join_html(
-    element("b", "Left: the truth"),
-    ", with noisy markers.",
-    BREAK,
-    element("b", "Right: the estimate"),
-    " from the markers. Bars: ± 2σ; blue is certain, orange is not.",
-    BREAK,
-    element("b", "In front: a stranger"),
-    ", a mechanism of unknown type. It is identified, then tracked.",
-)
+INTRODUCTION = """
+<b>Left: the truth</b>, with noisy markers.<br>
+<b>Right: the estimate</b> from the markers. Bars: ± 2σ; blue is certain, orange is not.<br>
+<b>In front: a stranger</b>, a mechanism of unknown type. It is identified, then tracked.
+"""
 
 
 class Panel:
@@ -59,7 +52,7 @@ class Panel:
 
     def __init__(self, gui: Any, simulation: Simulation, change_mechanism: Callable[[str], None]) -> None:
         self._simulation = simulation
-        HtmlBox(gui, _box(INTRODUCTION))
+        gui.add_html(_box(INTRODUCTION))
         self._paused = gui.add_checkbox("pause", False)
         self._speed = gui.add_slider("speed", 0.25, 3.0, 0.25, 1.0)
         with gui.add_folder("Sensor"):
@@ -67,12 +60,12 @@ class Panel:
             self._wrong = gui.add_checkbox(f"{WRONG:.0%} outliers", False)
             self._hidden = gui.add_checkbox(f"{MISSING:.0%} hidden", False)
         with gui.add_folder("The kitchen, tracked"):
-            self._kitchen = HtmlBox(gui, Html())
+            self._kitchen = gui.add_html("")
         with gui.add_folder("The stranger, learned"):
             names = list(MECHANISMS)
             self._choice = gui.add_dropdown("stranger", names, initial_value=simulation.mechanism.name)
             again = gui.add_button("Forget, and learn again")
-            self._learned = HtmlBox(gui, Html())
+            self._learned = gui.add_html("")
         self._choice.on_update(lambda event: self._choose(event.target.value))
         again.on_click(lambda _: change_mechanism(self._choice.value))
         self._change_mechanism = change_mechanism
@@ -99,13 +92,13 @@ class Panel:
 
     def update(self) -> None:
         """Update the reports."""
-        self._kitchen.show(format_kitchen(self._simulation))
-        self._learned.show(format_mechanism(self._simulation))
+        self._kitchen.content = format_kitchen(self._simulation)
+        self._learned.content = format_mechanism(self._simulation)
         if self._choice.value != self._simulation.mechanism.name:
             self._choice.value = self._simulation.mechanism.name
 
 
-def format_kitchen(simulation: Simulation) -> Html:
+def format_kitchen(simulation: Simulation) -> str:
     """Return HTML: errors of markers and of the track, its consistency, and the duration of an update."""
     quality = simulation.average_quality
     rejected = len(simulation.kitchen_tracker.estimate.outliers)
@@ -115,41 +108,37 @@ def format_kitchen(simulation: Simulation) -> Html:
     return _box(_table(rows))
 
 
-def format_mechanism(simulation: Simulation) -> Html:
+def format_mechanism(simulation: Simulation) -> str:
     """Return HTML: the probabilities of families so far, the identified joint, and its error."""
     learner, found = simulation.learner, simulation.learner.result
     if found is None:
-        return _box(element("b", "looking …"))
+        return _box("<b>looking …</b>")
     # Families have bars instead of rows.
     elsewhere = {fit.family for fit in found} | {"conclusion"}
     rows = [row for row in tabulate_identification(simulation)[1] if row[0] not in elsewhere]
-    return _box(element("b", str(found)), _table(rows), _bars(learner.history), *_history(learner.history))
+    return _box(
+        f"<b>{escape(str(found))}</b>{_table(rows)}{_bars(learner.history)}{_history(learner.history)}"
+    )
 
 
-def _bars(history: Sequence[FamilyProbabilities]) -> Html:
+def _bars(history: Sequence[FamilyProbabilities]) -> str:
     """Return a bar for each family with a noticeable probability."""
     lines = []
     for family, color in COLORS.items():
         share = history[-1].probabilities.get(family, 0.0)
         if share < 0.005:
             continue
-        lines.append(
-            element(
-                "div",
-                element("span", family, style="width:5.5em"),
-                element("span", style=f"background:{color};height:0.7em;width:{150 * share:.0f}px"),
-                element("span", f"{share:.2f}"),
-                style="display:flex;align-items:center;gap:6px",
-            )
-        )
-    return element("div", *lines, style="margin:4px 0")
+        bar = f"background:{color};height:0.7em;width:{150 * share:.0f}px"
+        parts = f'<span style="width:5.5em">{family}</span><span style="{bar}"></span>{share:.2f}'
+        lines.append(f'<div style="display:flex;align-items:center;gap:6px">{parts}</div>')
+    return f'<div style="margin:4px 0">{"".join(lines)}</div>'
 
 
-def _history(history: Sequence[FamilyProbabilities]) -> list[Html]:
+def _history(history: Sequence[FamilyProbabilities]) -> str:
     """Return a plot of probabilities over time, and its caption."""
     shown = history[-SHOWN:]
     if len(shown) < 2:
-        return []
+        return ""
     begin, end = shown[0].time, shown[-1].time
     lines = []
     for family, color in COLORS.items():
@@ -160,20 +149,18 @@ def _history(history: Sequence[FamilyProbabilities]) -> list[Html]:
             f"{WIDTH * (entry.time - begin) / (end - begin):.1f},{2 + (HEIGHT - 4) * (1.0 - value):.1f}"
             for entry, value in zip(shown, values, strict=True)
         )
-        lines.append(element("polyline", points=points, fill="none", stroke=color, stroke_width=2))
-    size = {"viewBox": f"0 0 {WIDTH} {HEIGHT}", "width": "100%", "height": HEIGHT}
-    white = "background:#fff;border:1px solid #dee2e6"
-    return [
-        element("svg", *lines, style=white, preserveAspectRatio="none", **size),
-        element("div", f"probabilities over the last {end - begin:.0f} s"),
-    ]
+        lines.append(f'<polyline points="{points}" fill="none" stroke="{color}" stroke-width="2"/>')
+    box = f'viewBox="0 0 {WIDTH} {HEIGHT}" width="100%" height="{HEIGHT}" preserveAspectRatio="none"'
+    style = "background:#fff;border:1px solid #dee2e6"
+    caption = f"<div>probabilities over the last {end - begin:.0f} s</div>"
+    return f'<svg {box} style="{style}">{"".join(lines)}</svg>{caption}'
 
 
-def _table(rows: Sequence[tuple[str, str]]) -> Html:
+def _table(rows: Sequence[tuple[str, str]]) -> str:
     left = "padding-right:10px;color:#868e96"
-    cells = [element("tr", element("td", name, style=left), element("td", value)) for name, value in rows]
-    return element("table", *cells, style="font-variant-numeric:tabular-nums")
+    lines = [f'<tr><td style="{left}">{escape(a)}</td><td>{escape(b)}</td></tr>' for a, b in rows]
+    return f'<table style="font-variant-numeric:tabular-nums">{"".join(lines)}</table>'
 
 
-def _box(*content: str) -> Html:
-    return element("div", *content, style="font-size:0.8em;line-height:1.4;padding:2px 10px 8px")
+def _box(content: str) -> str:
+    return f'<div style="font-size:0.8em;line-height:1.4;padding:2px 10px 8px">{content}</div>'

@@ -9,7 +9,6 @@ import io
 from base64 import b64encode
 from collections.abc import Iterable, Sequence
 from html import escape
-from itertools import islice
 from typing import Any
 
 ROWS = 50  # most rows of a table; further ones are counted, not listed
@@ -38,17 +37,14 @@ def join_html(*content: str) -> Html:
 
 
 def html_table(
-    caption: str, header: Sequence[str], rows: Iterable[Sequence[str]], total: int | None = None
+    caption: str, header: Sequence[str], rows: Sequence[Sequence[str]], total: int | None = None
 ) -> Html:
     """Return a table of texts, which are escaped; long texts and further rows are cut, with an ellipsis.
 
     ``total`` is the number of all rows, if ``rows`` are only the first ones.
     """
-    shown = list(islice(rows, ROWS + 1))
-    if total is None:
-        total = len(rows) if isinstance(rows, Sequence) else len(shown)
-    body = [_table_row("td", row) for row in shown[:ROWS]]
-    more = total - len(body)
+    body = [_table_row("td", row) for row in rows[:ROWS]]
+    more = (len(rows) if total is None else total) - len(body)
     if more > 0:
         cell = Html(f'<td colspan="{len(header)}" style="{_LEFT}">… {more} more</td>')
         body.append(element("tr", cell))

@@ -312,7 +312,7 @@ class State(Mapping[Symbol, float]):
     def _repr_html_(self) -> str:
         from kineverse._rich_display import html_table  # for start-up time
 
-        about = [f"{len(self)} values"]
+        about = [f"{len(self)} value{'' if len(self) == 1 else 's'}"]
         about += [] if self.stamp is None else [f"at {self.stamp:g} s"]
         about += [f"from {self.source}"] if self.source else []
         return html_table(

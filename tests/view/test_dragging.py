@@ -85,6 +85,40 @@ def test_a_hand_reaches_a_pose_with_and_without_its_base(still):
     assert moved == (set() if still else {"base/x", "base/y", "base/angle"})
 
 
+def test_on_a_base_that_stands_still_a_lift_keeps_its_orientation():
+    model = arm()
+    with model.edit() as edit:
+        edit.add_frame("lift", parent="base", transform=kv.translation(0, 0, kv.position("height")))
+    goal = np.array((kv.translation(1, 0, 0.4) @ kv.rotation_z(1))())
+    found = solve(DragSolver(model, "lift", find_base(model, "lift")), model, complete(model), goal)
+    assert found == {**complete(model), "height": pytest.approx(0.4, abs=1e-5)}
+
+
+def test_a_wheel_of_a_base_takes_the_base_along():
+    model = kv.load("articulations/differential_drive")
+    wheel, start = "differential_drive/base/left_wheel", complete(model)
+    assert find_base(model, wheel) == []
+    goal = fk(model, wheel, start)
+    goal[0, 3] += 0.5
+    found = solve(DragSolver(model, wheel), model, start, goal)
+    # The wheel also turns, which counts a little, and so does the base.
+    assert fk(model, wheel, found)[:3, 3] == pytest.approx(goal[:3, 3], abs=0.15)
+
+
+@pytest.mark.parametrize("distance", [0.3, 10.0, 1e5])
+def test_curved_limits_hold_however_far_the_gizmo_is(distance):
+    model, frame = kv.load("articulations/ball"), "ball/stick"
+    solver, start = DragSolver(model, frame), complete(model)
+    random = np.random.default_rng(0)
+    for turns in (False, True) * 3:
+        goal = fk(model, frame, start)
+        goal[:3, 3] += random.normal(0, distance, 3)
+        goal[:3, :3] = np.array(kv.rpy(*random.normal(0, 1, 3))())[:3, :3] @ goal[:3, :3]
+        found = solve(solver, model, start, goal, random.normal(0, 0.1, 3), turns)
+        assert found != start
+        assert all(violation.excess < 5e-3 for violation in model.violations(kv.State(found)))
+
+
 def test_a_goal_out_of_reach_ends_at_the_nearest_pose_at_rest():
     model = arm()
     solver = DragSolver(model, "hand", find_base(model, "hand"))
@@ -103,7 +137,7 @@ def test_a_drawer_follows_along_its_axis_within_its_limits(pull):
     goal = fk(model, "cabinet/drawer", start)
     goal[:3, 3] += pull, 0.2, 0.3
     found = solve(solver, model, start, goal)
-    assert found["cabinet/drawer"] == pytest.approx(min(max(0.2 - pull, 0.0), 0.4), abs=1e-6)
+    assert found["cabinet/drawer"] == pytest.approx(min(max(0.2 - pull, 0.0), 0.4), abs=1e-5)
 
 
 def test_a_point_of_a_door_is_held_and_its_orientation_gives_way():
@@ -129,7 +163,7 @@ def test_locks_and_limits_that_depend_on_the_state_hold():
     goal = np.eye(4)
     goal[:2, :2] = [[0, -1], [1, 0]]
     shut = solve(DragSolver(model, "door"), model, complete(model), goal, turns=True)
-    assert shut["door"] == pytest.approx(0.001, abs=1e-6)
+    assert -1e-6 < shut["door"] < 0.001 + 1e-6
     free = solve(DragSolver(model, "door"), model, complete(model, {"bolt": 0.1}), goal, turns=True)
     assert free["door"] == pytest.approx(1.5, abs=1e-6)
     lifted = np.array(kv.rotation_x(0.5)())
@@ -219,13 +253,13 @@ def test_poses_that_are_none_are_ignored(arm_page):
     before = page.values
     browser.start()
     for wxyz, position in (
-        ((1, 0, 0, 0), (math.nan, 0, 0)),
         ((math.nan, 0, 0, 0), (1, 0, 0)),
         ((0, 0, 0, 0), (1, 0, 0)),
         ((1, 0, 0, 0), (math.inf, 0, 0)),
+        ((1, 0, 0, 0), (1e300, 0, 0)),
+        ((1, 0, 0, 0), (math.nan, 0, 0)),
     ):
         browser.send(wxyz, position)
-    browser.send((1, 0, 0, 0), (1e300, 0, 0))
     browser.end()
     assert all(math.isfinite(value) for value in page.values.values())
     assert set(page.values) == set(before)
@@ -288,6 +322,28 @@ def test_a_click_chooses_the_body_in_front_and_the_point_on_it(page):
         Click.ray_direction = (0.0, 0.0, -1.0) if origin[2] == 9.0 else (1.0, 0.0, 0.0)
         page._drag._pick(Click)
         assert page._drag._grip is None
+
+
+@pytest.mark.parametrize("error", [kv.errors.KineverseError("no way"), ZeroDivisionError("no way")])
+def test_a_frame_without_a_solver_stays_and_says_why(page, monkeypatch, error):
+    made = []
+
+    def fail(*arguments):
+        made.append(arguments)
+        raise error
+
+    monkeypatch.setattr(dragging, "DragSolver", fail)
+    page._drag.choose("cabinet/drawer")
+    assert "no way" in page._drag._note.content
+    browser, before = Browser(page), page.values
+    browser.start()
+    browser.update(np.eye(4))
+    browser.end()
+    page.move({"cabinet/door": 0.3})
+    assert page.settled()
+    assert page.values == {**before, "cabinet/door": 0.3}
+    assert "no way" in page._drag._note.content
+    assert len(made) == 1
 
 
 def test_a_drag_stops_an_animation(page):

@@ -7,7 +7,7 @@ import json
 import time
 from typing import Any
 
-from kineverse.compilation.cache import library_cache
+from kineverse.compilation.cache import cache_folder
 from kineverse.compilation.cache_kinds import KINDS, CacheUsage, clear_kind, measure_kind
 from kineverse.errors import UnknownNameError, suggest
 
@@ -32,7 +32,11 @@ PERIODS = ((86400, "day"), (3600, "hour"), (60, "minute"))
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument(
-        "--clear", metavar="KIND", nargs="*", help="remove the files of these kinds; of all if none is named"
+        "--clear",
+        metavar="KIND",
+        nargs="*",
+        action="extend",
+        help="remove the files of these kinds; of all if none is named",
     )
     parser.add_argument("--json", action="store_true", help="one JSON object on standard output")
 
@@ -48,7 +52,7 @@ def run(arguments: argparse.Namespace) -> int:
     names = dict.fromkeys(arguments.clear or KINDS)
     found = {name: clear_kind(name) if is_cleared else measure_kind(name) for name in names}
     files, size = sum(usage.files for usage in found.values()), sum(usage.bytes for usage in found.values())
-    folder = library_cache().folder
+    folder = cache_folder()
     if arguments.json:
         kinds = {name: _to_json(usage) for name, usage in found.items()}
         print(json.dumps({"folder": str(folder), "removed" if is_cleared else "kinds": kinds}))

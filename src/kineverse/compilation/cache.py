@@ -128,7 +128,8 @@ class ContentCache:
         with open(path, "rb") as file:
             end = self._end(file.read())
         self.folder.adopt(path, key + self._ending, end)
-        files = sorted(self._files())
+        # One that is larger than the limit is not kept, instead of all others.
+        files = sorted(self._files(), key=lambda file: (file[1] <= self.most_bytes, file))
         excess = sum(size for _, size, _ in files) - self.most_bytes
         for _, size, other in files:
             if excess <= 0:
@@ -228,20 +229,26 @@ class LibraryCache:
         return tempfile.mkdtemp(prefix=UNFINISHED, dir=self.folder)
 
 
-def library_cache() -> LibraryCache:
-    """Return the cache of this user.
+def cache_folder() -> Path:
+    """Return the path of the cache of this user.
 
-    The folder is ``KINEVERSE_CACHE_DIR``, else ``kineverse`` in ``XDG_CACHE_HOME``, else
-    ``.cache/kineverse`` in ``HOME``, else in the home folder of the account; the last three are absolute
-    paths, or ignored. If the folder cannot be used, which is logged, it is a private one that is removed when
-    the process ends.
+    It is ``KINEVERSE_CACHE_DIR``, else ``kineverse`` in ``XDG_CACHE_HOME``, else ``.cache/kineverse`` in
+    ``HOME``, else in the home folder of the account; the last three are absolute paths, or ignored.
     """
     get = os.environ.get
-    where = get("KINEVERSE_CACHE_DIR"), get("XDG_CACHE_HOME"), get("HOME")
-    cache = _open(*where)
+    return _choose_folder(get("KINEVERSE_CACHE_DIR"), get("XDG_CACHE_HOME"), get("HOME"))
+
+
+def library_cache() -> LibraryCache:
+    """Return the cache of this user in :func:`cache_folder`.
+
+    If that folder cannot be used, which is logged, it is a private one that is removed when the process ends.
+    """
+    where = cache_folder()
+    cache = _open(where)
     if not cache.is_still_private:  # removed, or opened to others since
         _open.cache_clear()
-        cache = _open(*where)
+        cache = _open(where)
     return cache
 
 
@@ -269,28 +276,41 @@ def private_subfolder(name: str) -> PrivateFolder:
     except (NotPrivateError, OSError) as error:
         logger.warning(
             "What is computed is not kept for other processes: the cache folder %s",
-            _describe_failure(path, error),
+            describe_failure(path, error),
         )
     path = Path(_private_folder().name) / name
     path.mkdir(mode=0o700, exist_ok=True)
     return PrivateFolder(path, made=True)
 
 
+def describe_failure(folder: Path, error: Exception) -> str:
+    """Return the path of a cache folder that cannot be used, the reason, and what to do."""
+    if isinstance(error, OSError):
+        return f"{folder} cannot be made or opened ({error.strerror})."
+    return (
+        f"{folder} {error}. Others may have left code in it: remove it with all it holds, or set "
+        "KINEVERSE_CACHE_DIR to a folder of your own."
+    )
+
+
 @functools.lru_cache(maxsize=16)
-def _open(folder: str | None, caches: str | None, home: str | None) -> LibraryCache:
+def _choose_folder(folder: str | None, caches: str | None, home: str | None) -> Path:
     if folder:
-        wanted = Path(folder).absolute()
-    elif caches and os.path.isabs(caches):
-        wanted = Path(caches) / "kineverse"
-    else:
-        wanted = _home(home) / ".cache" / "kineverse"
+        return Path(folder).absolute()  # of the first working folder of the process
+    if caches and os.path.isabs(caches):
+        return Path(caches) / "kineverse"
+    return _home(home) / ".cache" / "kineverse"
+
+
+@functools.lru_cache(maxsize=16)
+def _open(wanted: Path) -> LibraryCache:
     if wanted not in _without_room:
         try:
             return LibraryCache(wanted)
         except (NotPrivateError, OSError) as error:
             logger.warning(
                 "Compiled functions are not kept for other processes: the cache folder %s",
-                _describe_failure(wanted, error),
+                describe_failure(wanted, error),
             )
     if not _private_folder_is_there():
         _private_folder.cache_clear()
@@ -333,15 +353,6 @@ def _home(home: str | None) -> Path:
         return Path(pwd.getpwuid(os.getuid()).pw_dir)
     except (ImportError, KeyError):  # Windows, or a user without an account
         return Path.home() if os.name == "nt" else Path(os.sep)
-
-
-def _describe_failure(folder: Path, error: Exception) -> str:
-    if isinstance(error, OSError):
-        return f"{folder} cannot be made or opened ({error.strerror})."
-    return (
-        f"{folder} {error}. Others may have left code in it: remove it with all it holds, or set "
-        "KINEVERSE_CACHE_DIR to a folder of your own."
-    )
 
 
 @contextlib.contextmanager

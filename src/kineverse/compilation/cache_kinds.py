@@ -6,16 +6,17 @@ kind larger than its limit, the files that were not used for the longest time ar
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import os
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from types import MappingProxyType
 
-from .cache import MAXIMUM_BYTES, ContentCache, library_cache, private_subfolder
+from .cache import MAXIMUM_BYTES, ContentCache, cache_folder, describe_failure, private_subfolder
 from .private_folder import NotPrivateError, PrivateFolder
 
 MIB = 2**20
@@ -73,11 +74,8 @@ class CacheUsage:
 
 def measure_kind(name: str) -> CacheUsage:
     """Return what the cache has of a kind; nothing is made or removed."""
-    kind, folder = KINDS[name], library_cache().folder / KINDS[name].folder
-    found = [status for _, status in _files(kind, folder)]
-    times = [status.st_mtime for status in found]
-    size = sum(status.st_size for status in found)
-    return CacheUsage(kind, folder, len(found), size, min(times, default=None), max(times, default=None))
+    folder = _open(name)
+    return _sum(name, [status for _, status in _files(name, folder)] if folder else [])
 
 
 def clear_kind(name: str) -> CacheUsage:
@@ -85,48 +83,41 @@ def clear_kind(name: str) -> CacheUsage:
 
     Processes that have loaded a file keep it.
     """
-    kind, before = KINDS[name], measure_kind(name)
-    if not before.files:
-        return before
-    folder = _open(before.folder)
-    if not kind.ending:
-        for entry, _ in list(folder.entries()):
-            if not folder.remove(entry):
-                shutil.rmtree(folder.path / entry, ignore_errors=True)
-    else:
-        for file, _ in _files(kind, before.folder):
-            folder.remove(file)
-    after = measure_kind(name)
+    folder = _open(name)
+    if folder is None:
+        return _sum(name, [])
+    removed = [status for path, status in _files(name, folder) if folder.remove(path)]
+    if not KINDS[name].ending:
+        shutil.rmtree(folder.path, ignore_errors=True)
+    return _sum(name, removed)
+
+
+def _sum(name: str, files: list[os.stat_result]) -> CacheUsage:
+    times, size = [status.st_mtime for status in files], sum(status.st_size for status in files)
+    folder = cache_folder() / KINDS[name].folder
     return CacheUsage(
-        kind,
-        before.folder,
-        before.files - after.files,
-        before.bytes - after.bytes,
-        before.oldest,
-        before.newest,
+        KINDS[name], folder, len(files), size, min(times, default=None), max(times, default=None)
     )
 
 
-def _files(kind: CacheKind, folder: Path) -> Iterator[tuple[str, os.stat_result]]:
-    """Yield the names and the status of the files of a kind."""
-    if not folder.is_dir():
-        return
-    if kind.ending:
-        opened = _open(folder)
-        yield from ((name, status) for name, status in list(opened.entries()) if name.endswith(kind.ending))
-        return
-    for place, _, names in os.walk(folder):
-        for name in names:
-            path = os.path.join(place, name)
-            try:
-                yield path, os.lstat(path)
-            except OSError:
-                continue  # removed meanwhile
+def _files(name: str, folder: PrivateFolder) -> list[tuple[str, os.stat_result]]:
+    """Return the names and the status of the files of a kind; links are not followed."""
+    if ending := KINDS[name].ending:
+        return [(name, status) for name, status in folder.entries() if name.endswith(ending)]
+    paths = [os.path.join(place, name) for place, _, names in os.walk(folder.path) for name in names]
+    result = []
+    for path in paths:
+        with contextlib.suppress(OSError):  # removed meanwhile
+            result.append((path, os.lstat(path)))
+    return result
 
 
-def _open(folder: Path) -> PrivateFolder:
-    """Return a folder of the cache that is there."""
+def _open(name: str) -> PrivateFolder | None:
+    """Return the folder of a kind; None if there is none."""
+    folder = cache_folder() / KINDS[name].folder
+    if not os.path.lexists(folder):
+        return None
     try:
         return PrivateFolder(folder)
-    except NotPrivateError as error:
-        raise PermissionError(None, f"{error}", str(folder)) from None
+    except (NotPrivateError, OSError) as error:
+        raise PermissionError(None, f"the cache folder {describe_failure(folder, error)}") from None

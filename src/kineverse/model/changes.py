@@ -106,7 +106,7 @@ class Diff:
     def _repr_html_(self) -> str:
         from kineverse._rich_display import html_table  # for start-up time
 
-        from .display import format_line
+        from .display import count_values, format_line
 
         def line(value: Any) -> str:
             return "" if value is None else format_line(value)
@@ -114,7 +114,7 @@ class Diff:
         rows = [(c.path, line(c.before), line(c.after)) for c in sorted(self.changes, key=lambda c: c.path)]
         kinds = ("added", "removed", "replaced", "moved", "rerun")
         rows += [(f"operation {tag}", "", kind) for kind in kinds for tag in getattr(self, kind)]
-        caption = f"{len(self.changes)} changes, version {self.version}"
+        caption = f"{count_values(len(self.changes), 'changes')}, version {self.version}"
         return html_table(caption, ("what", "before", "after"), rows)
 
     @property

@@ -19,6 +19,7 @@ from kineverse.lie import Array
 from .articulation import Articulation
 from .body import Mesh, Pose
 from .changes import Change, Diff, find_moved_tags
+from .display import count_values
 from .frame import Frame
 from .model import Model, Snapshot
 from .model_view import ModelView
@@ -298,16 +299,6 @@ class ValueDifference:
 class ModelComparison:
     """Differences between two models beyond a tolerance."""
 
-    def _repr_html_(self) -> str:
-        from kineverse._rich_display import html_table  # for start-up time
-
-        rows = [
-            (one.sign, one.change.path, ", ".join(part.what for part in one.parts))
-            for one in self.differences
-        ]
-        caption = f"{len(rows)} differences beyond {self.tolerance:g}"
-        return html_table(caption, ("", "what", "parts"), rows)
-
     def __init__(self, before: Model, after: Model, tolerance: float, operations: str = "auto") -> None:
         self.before, self.after, self.tolerance = before, after, tolerance
         self.diff: Diff = compare_models(before, after)
@@ -326,6 +317,17 @@ class ModelComparison:
                 self.differences.append(ValueDifference(change, counting))
             else:
                 self.alike.append(change.path)
+
+    def _repr_html_(self) -> str:
+        from kineverse._rich_display import html_table  # for start-up time
+
+        rows = [
+            (one.sign, one.change.path, ", ".join(part.what for part in one.parts))
+            for one in self.differences
+        ]
+        caption = f"{count_values(len(rows), 'differences')} beyond {self.tolerance:g}"
+        rows += [(sign, f"operation {tag}", "") for sign, tags in self.operations.items() for tag in tags]
+        return html_table(caption, ("", "what", "parts"), rows)
 
     def _reparented(self, samples: StateSamples) -> dict[str, Delta]:
         """Return the difference in world pose of all frames with a new parent.

@@ -142,9 +142,9 @@ def model_html(model: ModelView) -> Html:
     tree = order_depth_first({name: frame.parent for name, frame in model.frames.items() if name != WORLD})
     if tree:
         lines = [(_INDENTATION * depth + name, format_line(model.frames[name])) for name, depth in tree]
-        parts.append(folded(f"{len(model.frames)} frames", html_table("", ("frame", ""), lines)))
+        parts.append(folded(count_values(len(tree), "frames"), html_table("", ("frame", ""), lines)))
     for kind in ("constraints", "articulations", "bodies", "data", "rates"):
         values = getattr(model, kind)
         if values:
-            parts.append(folded(f"{len(values)} {kind}", values._repr_html_()))
+            parts.append(folded(count_values(len(values), kind), values._repr_html_()))
     return element("div", *parts)

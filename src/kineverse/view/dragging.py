@@ -37,6 +37,11 @@ logger = logging.getLogger(__name__)
 _DT = 0.5  # time of a step, for limits of speeds [s]; there is no clock
 _STEPS = 40  # most steps for an event: 5 ms for a mobile robot with two arms
 _SETTLED = 1e-7  # largest change of a coordinate that ends the steps
+_REACH = 0.1, 0.3
+"""Distances from the gizmo [m], [rad] beyond which it attracts no more: from afar steps would overshoot."""
+
+_STRIDE = 0.1  # largest change of a coordinate in a step [m], [rad], for limits that are curved
+
 _LEVER = 0.05
 """Weight of what is not dragged, position or orientation, relative to what is: a length [m]."""
 
@@ -49,13 +54,19 @@ def find_draggable(model: ModelView) -> list[str]:
 
 
 def find_base(model: ModelView, frame: str) -> list[Symbol]:
-    """Return the coordinates of the mobile base that carries a frame; none for its own frame."""
+    """Return the coordinates of the mobile base that carries a frame; none if nothing else moves it."""
     moving = {s for s in model.fk(frame).symbols if s.has_derivative}
     for record in model.articulations.values():
         base = moving.intersection(record.coordinates)
-        if record.parent == WORLD and len(base) >= _PLANAR and moving > base:
-            return sorted(base, key=lambda s: s.sort_key)
+        if record.parent == WORLD and len(base) >= _PLANAR:
+            # Its wheels turn only as it drives.
+            alone = _find_speeds(model, base).issuperset(model.speeds_of(frame))
+            return [] if alone else sorted(base, key=lambda s: s.sort_key)
     return []
+
+
+def _find_speeds(model: ModelView, coordinates: Iterable[Symbol]) -> set[Symbol]:
+    return {speed for s in coordinates for speed in model.rates.get(s, (s.derivative(),))}
 
 
 def find_moving(model: ModelView, frame: str) -> set[Symbol]:
@@ -87,12 +98,17 @@ class DragSolver:
         self._pose, self._point = Target("drag/pose", np.eye(4)), Target("drag/point", np.zeros(3))
         held = model.fk(frame) @ kv.translation(*self._point.expression)
         errors = [error(self._pose.expression, held) for error in (same_position, same_orientation)]
+        fixed = {*model.degrees_of_freedom} - find_moving(model, frame) | {*still}
         # A drawer keeps its orientation, for which there is no goal.
         self._weights = {
-            k: kv.parameter(f"drag/weight{k}", 1.0) for k, error in enumerate(errors) if error.gradient()
+            k: kv.parameter(f"drag/weight{k}", 1.0)
+            for k, error in enumerate(errors)
+            if error.gradient().keys() - _find_speeds(model, fixed)
         }
-        tasks = [Goal(errors[k], gain=1 / _DT, weight=weight) for k, weight in self._weights.items()]
-        fixed = {*model.degrees_of_freedom} - find_moving(model, frame) | {*still}
+        tasks = [
+            Goal(errors[k], gain=1 / _DT, speed=_REACH[k] / _DT, weight=weight)
+            for k, weight in self._weights.items()
+        ]
         self._controller = Controller(model, tasks, dt=_DT, fixed=fixed, smooth=0.0, posture=0.0)
 
     def solve(
@@ -113,8 +129,10 @@ class DragSolver:
         final = False
         for _ in range(_STEPS):
             speeds = controller.step(state).speeds
-            state = self._model.integrate(state, speeds, _DT)
-            final = _DT * max(map(abs, speeds.values()), default=0.0) < _SETTLED
+            change = _DT * max(map(abs, speeds.values()), default=0.0)
+            shorter = min(1.0, _STRIDE / max(change, _SETTLED))
+            state = self._model.integrate(state, {s: shorter * v for s, v in speeds.items()}, _DT)
+            final = change < _SETTLED
             if final:
                 break
         return {s: float(state[s]) for s in values if state[s] != before[s]}, final
@@ -161,7 +179,7 @@ class FrameDrag:
         self._marks: list[Any] = []
         self._controls: tuple[Any, Any] | None = None
         self._note: HtmlBox | None = None
-        self._solvers: dict[tuple[str, bool], DragSolver] = {}
+        self._solvers: dict[tuple[str, bool], DragSolver | None] = {}
         self._holder: int | None = None  # the browser that drags
         self._start, self._wanted = np.eye(4), np.eye(4)
         self._pending = False
@@ -249,13 +267,15 @@ class FrameDrag:
             model, grip, still, solvers = self._model, self._grip, self._still, self._solvers
             if grip is None or (grip.frame, still) in solvers:
                 return
-        try:
-            solver = DragSolver(model, grip.frame, find_base(model, grip.frame) if still else ())
-        except KineverseError as error:
-            self._failure = str(error)
-            return
         # These are others after an edit.
-        solvers[grip.frame, still] = solver
+        try:
+            solvers[grip.frame, still] = DragSolver(
+                model, grip.frame, find_base(model, grip.frame) if still else ()
+            )
+        except Exception as error:
+            solvers[grip.frame, still] = None
+            self._fail(error)
+            self._tell()
 
     def step(self, values: Mapping[str, float]) -> dict[str, float]:
         """Return the values that change for the frame to follow the gizmo, once there is a solver."""
@@ -270,12 +290,8 @@ class FrameDrag:
                 try:
                     changed, final = solver.solve(values, wanted, grip.point, turns=turns)
                     self._failure = ""
-                except KineverseError as error:
-                    self._failure = str(error)
                 except Exception as error:
-                    # The thread that draws survives any error.
-                    logger.exception("a frame could not be dragged")
-                    self._failure = f"{type(error).__name__}: {error}"
+                    self._fail(error)
             # Nothing follows a gizmo that was released.
             self._pending = not final and self._holder is not None
             return changed
@@ -288,12 +304,20 @@ class FrameDrag:
             if self._holder is None and not self._pending:
                 pose = self._held_pose()
                 wxyz = to_wxyz(pose[None])[0]
-                if np.abs(self._gizmo.position - pose[:3, 3]).max() > 1e-9 or not np.allclose(
-                    self._gizmo.wxyz, wxyz, atol=1e-9
-                ):
+                shown = *self._gizmo.position, *self._gizmo.wxyz
+                # NaN, which a browser may have sent, is not close.
+                if not np.allclose(shown, (*pose[:3, 3], *wxyz), rtol=0.0, atol=1e-9):
                     self._gizmo.position, self._gizmo.wxyz = pose[:3, 3], wxyz
             self._show_distance()
         self._tell()
+
+    def _fail(self, error: Exception) -> None:
+        """Note why a frame does not follow: the thread that draws survives any error."""
+        if isinstance(error, KineverseError):
+            self._failure = str(error)
+        else:
+            logger.exception("a frame could not be dragged")
+            self._failure = f"{type(error).__name__}: {error}"
 
     def _held_pose(self) -> Floats:
         assert self._grip is not None
@@ -319,10 +343,11 @@ class FrameDrag:
 
     def _pick(self, event: Any) -> None:
         """Choose the point of a body that was clicked; nothing where there is none, or none that moves."""
-        if self._controls is None:
+        controls = self._controls
+        if controls is None:
             return
         hit = self._scene.pick(event.ray_origin, event.ray_direction)
-        if hit is None or hit[0] not in self._controls[0].options:
+        if hit is None or hit[0] not in controls[0].options:
             self.choose(None)
         else:
             self.choose(*hit)

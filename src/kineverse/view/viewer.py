@@ -266,7 +266,7 @@ class Viewer:
             self._change.notify_all()
         if self._listener is not None:
             self._listener.close()
-        self._worker.join(timeout=5.0)
+        self._worker.join(timeout=20.0)
         self.collisions.worker.stop()
         web.stop(self._server)
         self._ended.set()

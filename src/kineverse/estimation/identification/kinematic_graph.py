@@ -36,6 +36,7 @@ from kineverse.estimation.identification.result import SURE, Fit, Identification
 from kineverse.estimation.linear_algebra import singularity_named, squared_errors
 from kineverse.estimation.noise import Outliers
 from kineverse.lie import Array, inverse, skew
+from kineverse.model.display import count_values
 from kineverse.model.frame import WORLD
 from kineverse.model.model import Model
 from kineverse.model.operation import Operation
@@ -495,7 +496,8 @@ class KinematicGraph(TableDisplay):
             for edges, closes in ((self.edges, False), (self.loops, True))
             for edge in edges
         ]
-        caption = f"{len(self.bodies)} bodies, {len(self.edges)} joints, {len(self.loops)} loops"
+        kinds = {"bodies": self.bodies, "joints": self.edges, "loops": self.loops}
+        caption = ", ".join(count_values(len(parts), kind) for kind, parts in kinds.items())
         return html_table(caption, ("parent", "child", "joint", "connection", ""), rows)
 
 

@@ -8,6 +8,7 @@ from typing import Any, Literal, TypeAlias
 
 from kineverse.errors import UnknownNameError, suggest
 from kineverse.expressions.printing import format_number
+from kineverse.model.display import count_values
 from kineverse.symbols import Symbol
 
 Severity: TypeAlias = Literal["finding", "suspect", "cannot_say"]
@@ -200,7 +201,8 @@ class MotionReport:
             for report in self.all
             for entry in (*report.findings, *report.suspects, *report.cannot_say)
         ]
-        caption = f"{len(self.findings)} findings, {len(self.suspects)} suspects"
+        kinds = {"findings": self.findings, "suspects": self.suspects}
+        caption = ", ".join(count_values(len(found), kind) for kind, found in kinds.items())
         return html_table(caption, ("coordinate", "", "kind", "what", "advice"), rows)
 
     def __getitem__(self, name: Symbol | str) -> CoordinateReport:

@@ -58,7 +58,7 @@ def test_an_empty_cache_has_all_kinds_and_makes_no_folder(folder: Path, run) -> 
     assert (status, err) == (0, "")
     assert all(re.search(rf"^{name} .* 0 ", out, re.MULTILINE) for name in KINDS)
     assert out.splitlines()[-1] == f"0 files, 0 B in {folder}"
-    assert [*folder.iterdir()] == []
+    assert not folder.exists()
 
 
 def test_each_kind_counts_its_own_files(folder: Path, run) -> None:
@@ -81,7 +81,7 @@ def test_one_kind_is_cleared_and_the_others_stay(folder: Path, run) -> None:
     assert "sphere_trees: 1 file removed" in out
     assert "zig: 1 file removed, 45 B" in out
     assert out.splitlines()[-1].startswith(f"2 files removed from {folder}, ")
-    assert not any((folder / "zig").iterdir())
+    assert not (folder / "zig").exists()
     assert CACHES["sphere_covers"].list_keys() == ["a" * 40]
     assert {name for name in KINDS if measure_kind(name).files} == {*KINDS} - {"sphere_trees", "zig"}
 
@@ -100,6 +100,45 @@ def test_what_does_not_belong_to_a_kind_stays(folder: Path, run) -> None:
     (folder / "note.txt").write_text("mine", "utf-8")
     run("cache", "--clear")
     assert (folder / "note.txt").read_text("utf-8") == "mine"
+
+
+def test_links_and_other_names_of_files_are_removed_and_not_what_they_lead_to(
+    folder: Path, tmp_path: Path, run
+) -> None:
+    fill(folder)
+    theirs = [tmp_path / "theirs" / name for name in ("linked", "named")]
+    theirs[0].parent.mkdir()
+    for path in theirs:
+        path.write_text("theirs", "utf-8")
+    (folder / "c.so").symlink_to(theirs[0])
+    (folder / "files" / "c.mesh").hardlink_to(theirs[1])
+    (folder / "zig" / "o" / "c").symlink_to(theirs[0].parent)
+    assert run("cache", "--clear")[0] == 0
+    assert [path.read_text("utf-8") for path in theirs] == ["theirs"] * 2
+    assert not any(path.is_symlink() or path.is_file() for path in folder.rglob("*"))
+
+
+def test_kinds_of_an_option_that_stands_twice_are_both_cleared(folder: Path, run) -> None:
+    fill(folder)
+    run("cache", "--clear", "meshes", "--clear", "zig")
+    assert {name for name in KINDS if not measure_kind(name).files} == {"meshes", "zig"}
+
+
+@pytest.mark.parametrize("words", [(), ("--clear",)], ids=["shown", "cleared"])
+def test_a_folder_that_cannot_be_used_is_named_and_no_other_is_cleared(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, run, words: tuple[str, ...]
+) -> None:
+    fill(folder)
+    folder.chmod(0o777)
+    status, out, err = run("cache", *words)
+    assert (status, out) == (2, "")
+    assert f"the cache folder {folder} can be written by others" in err
+    assert (folder / "zig" / "o" / "crt1.o").is_file()
+    (tmp_path / "file").write_text("mine", "utf-8")
+    monkeypatch.setenv("KINEVERSE_CACHE_DIR", str(tmp_path / "file"))
+    status, out, err = run("cache", *words)
+    assert (status, out, err.count("\n")) == (2, "", 1)
+    assert f"{tmp_path / 'file'} cannot be" in err
 
 
 @pytest.mark.parametrize("target", ["spheres", "files"])
@@ -153,6 +192,7 @@ def test_a_kind_that_reaches_its_limit_loses_what_was_not_used_for_the_longest_t
     cache.most_bytes = 2000
     try:
         cache.write("d", bytes(900))
+        cache.write("e", bytes(3000))  # never fits
     finally:
         cache.most_bytes = most
     assert sorted(cache.list_keys()) == ["a", "d"]
