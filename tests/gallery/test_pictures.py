@@ -80,7 +80,7 @@ def wanted_in_gallery() -> list[str]:
     return [
         *(f"(../{path.relative_to(ROOT).as_posix()})" for path in scripts),
         "(../examples/living_kitchen)",
-        *(f"`articulations/{name}`" for name in gallery.names()),
+        *(f": `{name}`" for name in gallery.names()),
         *(f"`kineverse {skill}" for skill in SKILLS),
     ]
 

@@ -15,7 +15,6 @@ STUDIES = {
     "fig3": "",
     "fig4": "--quick",
     "estimation-grid": "--quick",
-    "conversion": "--quick",
 }
 """Options of the experiments whose figures take little time; ``--quick`` for a short form."""
 
