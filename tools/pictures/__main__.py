@@ -17,7 +17,7 @@ from example_pictures import EXAMPLE_PICTURES, MOVING_EXAMPLES
 from films import FILMS, draw_film
 from peers import PEERS, draw_peer, draw_targets
 from scene_cameras import fit_scene_camera
-from skills import SKILL_PICTURES
+from skills import SKILL_PICTURES, draw_fetch, draw_push
 from small_files import encode_small_clip, encode_small_picture
 from study_figures import STUDIES, draw_study
 from tour import draw_tour
@@ -55,6 +55,8 @@ def list_pictures() -> Mapping[str, Callable[[], Drawn]]:
             "lockbox.png": lockbox.draw_thesis_box,
             "inverse_kinematics_ur10.png": draw_targets,
             "open_close.webp": draw_tour,
+            "open_fetch.webp": draw_fetch,
+            "push_hsr.webp": draw_push,
         }
     )
 

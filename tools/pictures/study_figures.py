@@ -13,21 +13,10 @@ WIDTH = 720
 
 STUDIES = {
     "fig3": "",
-    "joint-families": "--quick",
-    "joint-types": "--quick",
-    "estimation-grid": "--quick",
-    "stream": "--quick",
     "fig4": "--quick",
-    "calibration": "--quick",
-    "checks": "--quick",
-    "conversion": "--quick",
-    "lockbox": "--quick",
-    "kitchens": "--quick",
-    "table1-open": "--quick",
-    "unknown-objects": "--quick",
-    "ablations": "--quick",
+    "estimation-grid": "--quick",
 }
-"""Options of the experiments that are drawn; ``--quick`` for what takes long."""
+"""Options of the experiments whose figures take little time; ``--quick`` for a short form."""
 
 
 def draw_study(name: str) -> np.ndarray:
