@@ -115,6 +115,7 @@ def encode_clip(
     if len({image.shape for image in pictures}) != 1:
         raise ShapeError("a clip is one or more pictures of one size")
     images = [pillow.fromarray(image) for image in pictures]
+    defaults: dict[str, Any]
     if suffix.lower() == ".gif":
         # One palette for all pictures: what stands still keeps its colours, and need not be written again.
         some = np.concatenate(pictures[:: max(len(pictures) // 8, 1)])
