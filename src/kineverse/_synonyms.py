@@ -176,6 +176,7 @@ EXPRESSION_SYNONYMS = _by_name(
         "64-bit floats, once it is called with values, e({name: number})": "dtype",
         "the expression itself; there are no complex numbers": "real conj",
         "e.ravel()": "flat",
+        "model.speeds_of(frame), of a Jacobian": "columns",
         "np.linalg.inv(e)": "inv inverse",
         "np.linalg.det(e)": "det",
         "kv.norm(e), or np.linalg.norm(e)": "norm",
