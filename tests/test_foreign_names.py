@@ -12,9 +12,10 @@ import pytest
 
 import kineverse as kv
 from kineverse import _synonyms
+from kineverse._names import answer_foreign_names, match_names
 from kineverse.compilation import CompiledFunction
 from kineverse.control import Command, Controller, IkResult, InverseKinematics
-from kineverse.errors import UnknownAttributeError
+from kineverse.errors import KineverseError, UnknownAttributeError
 from kineverse.estimation import Estimate, IdentificationResult, Tracker
 from kineverse.geometry import DistanceResult, Scene
 from kineverse.planning import Path, Planner, Trajectory
@@ -56,7 +57,7 @@ TRIED: dict[Any, str] = {
         inverse_kinematics→inverse_kinematics ikine_LM→inverse_kinematics solve_ik→inverse_kinematics
         com→center_of_mass scene→Scene plan→Planner add_joint→model.edit show→kv.show update_cfg→model.fk
         getFrameId→model.frames existFrame→model.frames step→model.integrate state→default_state
-        add_frame→add_frame variables→model.symbols
+        add_frame→add_frame variables→model.symbols Joints→articulations Com→center_of_mass FK→'fk'
     """,
     kv.model.Edit: """
         apply add_frame constrain remove add→edit.apply add_joint→edit.apply add_link→edit.add_frame
@@ -140,6 +141,23 @@ def _names(owner: Any) -> set[str]:
     return {*dir(owner), *getattr(owner, "__annotations__", ()), *re.findall(r"self\.(\w+)\b", source)}
 
 
+@pytest.mark.parametrize("wrong", [["a"], {"a": 1}, 5, None])
+def test_what_is_no_name_is_said_to_be_none(wrong: Any) -> None:
+    model = kv.Model()
+    for ask in (model.fk, lambda name: model.fk("world", name), model.symbol, model.limits):
+        with pytest.raises(KineverseError, match="by its name, a text"):
+            ask(wrong)
+
+
+def test_long_names_are_cut_in_messages() -> None:
+    model, long = kv.Model(), "long" * 1000
+    lookups = (model.fk, model.symbol, model.constraints.__getitem__, lambda n: getattr(model, n))
+    for ask in (*lookups, lambda name: match_names(name, ["a"], "part"), lambda n: kv.position("a")({n: 1})):
+        with pytest.raises(KineverseError) as error:
+            ask(long)
+        assert len(str(error.value)) < 400
+
+
 def test_there_are_many() -> None:
     assert sum(len(text.split()) for text in TRIED.values()) >= 250
 
@@ -170,6 +188,18 @@ def test_answers_exist_and_names_of_others_do_not(name: str) -> None:
             assert attrgetter(path)(kv) is not None
         for attribute in re.findall(rf"(?<![\w.]){begin}\.(\w+)", answer):
             assert attribute in names, answer
+
+
+@answer_foreign_names("A thing", {})
+class Thing:
+    @property
+    def name(self) -> str:
+        raise AttributeError("the reason")
+
+
+def test_a_property_that_fails_says_why() -> None:
+    with pytest.raises(AttributeError, match="the reason"):
+        _ = Thing().name
 
 
 def test_an_object_that_answers_can_be_pickled_and_asked() -> None:

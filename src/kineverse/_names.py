@@ -46,9 +46,9 @@ def no_match_error(text: str, known: Iterable[str], what: str, argument: str = "
     """Return the error for a name that does not exist, or for a pattern that matches nothing."""
     names = list(dict.fromkeys(known))
     if is_pattern(text):
-        problem, hint = f"no {what} matches '{text}'.", _suggest_patterns(text, names, what)
+        problem, hint = f"no {what} matches {text!r:.80}.", _suggest_patterns(text, names, what)
     else:
-        problem, hint = f"there is no {what} '{text}'.", suggest(text, names, what)
+        problem, hint = f"there is no {what} {text!r:.80}.", suggest(text, names, what)
     begin = f"{argument}: {problem}" if argument else problem[0].upper() + problem[1:]
     return UnknownNameError(f"{begin} {hint}")
 
@@ -61,8 +61,8 @@ def answer_foreign_names(owner: str, synonyms: Mapping[str, str]) -> Callable[[K
     """
 
     def find(thing: Any, name: str) -> Any:
-        if hasattr(type(thing), name):  # a slot without a value yet, or a property that failed
-            raise AttributeError(name)
+        if hasattr(type(thing), name):  # a slot without a value yet, or a property that failed: its error
+            return object.__getattribute__(thing, name)
         known = () if name.startswith("_") else dir(thing)
         raise unknown_attribute_error(owner, name, known, synonyms)
 

@@ -407,17 +407,17 @@ def unknown_attribute_error(
     import difflib
 
     below = below or {}
-    problem = f"{owner} has no {name!r}."
+    problem = f"{owner} has no {name!r:.80}."
     if name.startswith("_"):
         return UnknownAttributeError(problem)
-    if name in elsewhere:
-        return UnknownAttributeError(f"{problem} Here that is {elsewhere[name]}.")
-    if name in below:
-        return UnknownAttributeError(f"{problem} Here that is {below[name]}.")
     public = sorted({one for one in available if not one.startswith("_")})
     by_lower: dict[str, str] = {one.lower(): place for one, place in below.items()}
     by_lower |= {one.lower(): one for one in public}
     lower = name.lower()
+    foreign = {one.lower(): answer for one, answer in elsewhere.items()}
+    answer = elsewhere.get(name) or below.get(name) or (None if lower in by_lower else foreign.get(lower))
+    if answer:
+        return UnknownAttributeError(f"{problem} Here that is {answer}.")
     matches = [lower] if lower in by_lower else difflib.get_close_matches(lower, by_lower, n=3, cutoff=0.6)
     close = [by_lower[match] for match in matches]
     if close:

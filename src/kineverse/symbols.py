@@ -300,13 +300,15 @@ def parse_symbol_name(name: str) -> tuple[str, int]:
     Raises
     ------
     ExpressionError
-        If the part behind the colon is not an order.
+        If it is no text, or the part behind the colon is not an order.
 
     Examples
     --------
     >>> kv.symbols.parse_symbol_name("kitchen/door:velocity")
     ('kitchen/door', 1)
     """
+    if not isinstance(name, str):
+        raise ExpressionError(f"A symbol is asked for by its name, a text, not by {name!r:.80}.")
     escaped, colon, suffix = name.partition(":")
     path = re.sub("%(25|3A)", lambda m: {"25": "%", "3A": ":"}[m[1]], escaped)
     if not colon:

@@ -13,6 +13,8 @@ import pytest
 from kineverse.cli import live_system
 from kineverse.live import live_status
 
+pytestmark = pytest.mark.compiler  # without one, the command refuses before all else
+
 
 @pytest.fixture
 def extras() -> None:

@@ -8,10 +8,13 @@ from types import SimpleNamespace
 import pytest
 
 import kineverse as kv
+from kineverse.cli import manipulate
 from kineverse.manipulation.outcome import Outcome
 
 pytest.importorskip("coal")
 pytest.importorskip("daqp")
+
+pytestmark = pytest.mark.compiler  # without one, these commands refuse before all else
 
 ARM = """<robot name="arm">
   <link name="root"/>
@@ -152,6 +155,14 @@ def test_without_a_handle_it_is_not_done_and_says_how_else(run, files):
         assert (status, answer["done"], answer["steps"]) == (1, False, 0)
         assert "moves no handle" in answer["reason"]
         assert "kineverse push" in answer["reason"]
+
+
+@pytest.mark.parametrize(
+    ("value", "unit", "said"),
+    [(0.5, "m", "0.5 m"), ("", "", "-"), (None, "m", "-"), (["", ""], "", "-"), (3, "", "3")],
+)
+def test_a_measure_is_printed_with_its_unit(value, unit, said):
+    assert manipulate._format_measure(value, unit) == said
 
 
 def test_what_is_there_from_the_start_is_done(run, files):

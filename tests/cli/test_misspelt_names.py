@@ -17,6 +17,7 @@ DOOR = ("--robot", "hsr", "--what", "kitchen/fridge_door")
         ("info kitchen --jsno", "--json"),
         ("open kitchen --robbot hsr", "--robot"),  # and not that --robot is missing
         ("--verbsoe info kitchen", "--verbose"),
+        ("-x", "--help"),  # and not that a command is missing
         ("info kithcen", "kitchen"),
         ("info articulations/scrw", "articulations/screw"),
         ("unlock lockboxes/thesi --goal lockbox/a=1.2", "lockboxes/thesis"),
@@ -33,9 +34,17 @@ DOOR = ("--robot", "hsr", "--what", "kitchen/fridge_door")
         (" ".join((*GRIP, "--still", "fetc/*")), "fetch/*"),
         (" ".join((*GRIP, "--still", "fetch/bas")), "fetch/base"),
         (" ".join((*GRIP, "--from", "fetch/torso_lift_jont=0.1")), "fetch/torso_lift_joint"),
-        ("plan shelf_door --to shelf_door/dor=80deg", "shelf_door/door"),
-        ("plan shelf_door --to shelf_door/door=80deg --move shelf_dor/*", "shelf_door/*"),
-        ("plan shelf_door --to shelf_door/door=80deg --leave-out shelf_dor/*", "shelf_door/*"),
+        pytest.param("plan shelf_door --to shelf_door/dor=80deg", "shelf_door/door", marks=pytest.mark.long),
+        pytest.param(
+            "plan shelf_door --to shelf_door/door=80deg --move shelf_dor/*",
+            "shelf_door/*",
+            marks=pytest.mark.long,
+        ),
+        pytest.param(
+            "plan shelf_door --to shelf_door/door=80deg --leave-out shelf_dor/*",
+            "shelf_door/*",
+            marks=pytest.mark.long,
+        ),
         ("unlock lockboxes/thesis --goal lockbox/aa=1.2", "lockbox/a"),
         ("unlock lockboxes/thesis --goal lockbox/a=1.2 --still lokbox/*", "lockbox/*"),
         ("unlock lockboxes/thesis --goal lockbox/a=1.2 --execute --jam lokbox/*", "lockbox/*"),
@@ -65,13 +74,19 @@ def test_the_nearest_name_is_said(run: Any, line: str, right: str) -> None:
     [
         ("fk kitchen kitchen/fridge_door_handle --set kitchen/fridge_door=12cm", "is in rad"),
         (" ".join((*GRIP, "--from", "fetch/torso_lift_joint=90deg")), "is in m"),
-        ("plan shelf_door --to shelf_door/door=80cm", "is in rad"),
-        ("plan shelf_door --to shelf_door/door=1 --from shelf_door/door=80cm", "is in rad"),
+        pytest.param("plan shelf_door --to shelf_door/door=80cm", "is in rad", marks=pytest.mark.long),
+        pytest.param(
+            "plan shelf_door --to shelf_door/door=1 --from shelf_door/door=80cm",
+            "is in rad",
+            marks=pytest.mark.long,
+        ),
         (" ".join(("open", "kitchen", *DOOR, "--to", "20cm")), "is in rad"),
         (" ".join(("open", "kitchen", *DOOR, "--set", "kitchen/oven_door=12cm")), "is in rad"),
         ("reach fetch fetch/gripper_link --pose 0.7deg 0.2 0.9", "is not a length"),
         ("reach fetch fetch/gripper_link --pose 0.7 0.2 0.9 0 90cm 0", "is not an angle"),
-        ("plan fetch --to fetch/gripper_link@0.7deg,0.2,0.9", "is not a length"),
+        pytest.param(
+            "plan fetch --to fetch/gripper_link@0.7deg,0.2,0.9", "is not a length", marks=pytest.mark.long
+        ),
     ],
 )
 def test_a_unit_of_another_kind_is_refused(run: Any, line: str, said: str) -> None:
@@ -81,7 +96,7 @@ def test_a_unit_of_another_kind_is_refused(run: Any, line: str, said: str) -> No
 
 
 def test_help_and_verbose_are_taken_before_and_after_the_command(run: Any) -> None:
-    assert run("--help", "info") == run("info", "kitchen", "--help")
+    assert run("--help", "info") == run("-v", "--help", "info") == run("info", "kitchen", "--help")
     assert run("-v", "info", "kitchen") == run("info", "kitchen", "-v") == run("info", "-v", "kitchen")
 
 

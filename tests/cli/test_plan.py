@@ -72,6 +72,7 @@ def test_no_path_ends_with_status_1_and_the_reason(run):
     assert (status, "MODEL comes first" in err) == (2, True)
 
 
+@pytest.mark.compiler  # without one, the command refuses earlier
 def test_without_a_compiler_it_says_what_works(run, monkeypatch):
     from kineverse.compilation.c_library import SourceLibrary
 

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import os
+import signal
+from contextlib import ExitStack
+
 import pytest
 
 pytest.importorskip("zenoh")
@@ -10,9 +14,19 @@ pytest.importorskip("cryptography")
 
 from faults import edge
 from faults import server as faults
+from faults.processes import folder, start
 
 BUSY = 5.0
 """Longest time of an edit on a machine that does other things as well [s]."""
+
+
+def test_how_a_process_has_ended_is_said() -> None:
+    with folder() as path, ExitStack() as running:
+        faults.make_store(path / "home.db")
+        server = start(running, "served", path / "home.db")
+        os.kill(server.id, signal.SIGKILL)
+        with pytest.raises(AssertionError, match="has ended, killed by SIGKILL"):
+            server.ask("state")
 
 
 def test_a_second_server_of_a_store_or_a_name_is_refused() -> None:

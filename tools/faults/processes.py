@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import faulthandler
 import importlib
 import json
 import multiprocessing
@@ -24,6 +25,7 @@ from unittest.mock import patch
 PATIENCE = 60.0
 """Time after which a process that says nothing counts as a violation [s]."""
 
+_UNKNOWN_STATUS = 255  # that multiprocessing gives if the process that forks others has ended
 # Processes are forked from one that has imported what takes a second of CPU time, and does nothing else.
 _context = multiprocessing.get_context("forkserver")
 _context.set_forkserver_preload(["zenoh", "faults.messages", "faults.relayed", "kineverse.exchange.server"])
@@ -74,9 +76,18 @@ class Process:
             raise AssertionError(f"{self.what}: no reply within {timeout:g} s") from None
         self.check()
         if told is None:
-            self._process.join()
-            raise AssertionError(f"{self.what}: has ended, with status {self._process.exitcode}")
+            raise AssertionError(f"{self.what}: has ended, {self._explain_end()}")
         return told["reply"]
+
+    def _explain_end(self) -> str:
+        """Return how the process has ended; what it has written to stderr was seen when it was written."""
+        self._process.join()
+        status = self._process.exitcode
+        if status == _UNKNOWN_STATUS:
+            return "and so has the process that it was forked from: perhaps both were killed"
+        return (
+            f"killed by {signal.Signals(-status).name}" if status and status < 0 else f"with status {status}"
+        )
 
     def ask(self, *words: object, timeout: float = PATIENCE) -> Any:
         """Tell something and return the reply."""
@@ -123,6 +134,7 @@ def _run(
 ) -> None:
     os.environ.clear()
     os.environ.update(environment)
+    faulthandler.enable()  # where it was, for one that is ended by a defect in native code
     random.seed()
     sys.argv = [module, *arguments]
     sys.stdin = os.fdopen(stdin.fileno(), encoding="utf-8", closefd=False)

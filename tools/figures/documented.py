@@ -281,10 +281,10 @@ JOINTS = (
 
 _WORST: Mapping[str, Rule] = {
     "robot": KEY,
-    "limits violated": Largest(least=1e-9),
+    "limits violated [own unit]": Largest(least=1e-9),
     "contact losses": LARGEST,
     "penetration [mm]": LARGEST,
-    "jitter": LARGEST,
+    "jitter [m/s, rad/s]": LARGEST,
 }
 _PUSH: Mapping[str, Rule] = {"skill": KEY, "robot": KEY}
 

@@ -325,19 +325,21 @@ def make_parser(name: str | None = None) -> argparse.ArgumentParser:
 
 
 def _parse_arguments(words: Sequence[str]) -> argparse.Namespace:
-    name = next((word for word in words if not word.startswith("-")), None)
-    if name is not None and words[0] in ("-h", "--help"):
-        words = [name, words[0]]  # help of the command, wherever it is asked for
+    at = next((k for k, word in enumerate(words) if not word.startswith("-")), len(words))
+    name = words[at] if at < len(words) else None
+    if name is not None and not {"-h", "--help"}.isdisjoint(words[:at]):
+        words = [name, "--help"]  # help of the command, wherever it is asked for
     # A leading space tells argparse that -30deg, -pi/2 or -1e-3 is a value and no option.
     words = [f" {word}" if _NEGATIVE_VALUE.match(word) else word for word in words]
     try:
         arguments, unknown = make_parser(name).parse_known_args(words)
     except _UsageError as error:
         # A misspelt option is why another one is missing.
-        known, asked = error.parser._option_string_actions, [w.partition("=")[0] for w in words]
-        for word in asked:
-            if word.startswith("--") and len(word) > 2 and not any(o.startswith(word) for o in known):
-                raise _unknown_option_error(error.parser, word) from None
+        known = error.parser._option_string_actions
+        for word in words:
+            asked = word.partition("=")[0] if word.startswith("--") else word[:2]  # -n5 is -n 5
+            if re.match("--?[^-]", asked) and not any(option.startswith(asked) for option in known):
+                raise _unknown_option_error(error.parser, asked) from None
         argparse.ArgumentParser.error(error.parser, str(error))
     if unknown:
         sub: argparse.ArgumentParser = arguments.command

@@ -534,7 +534,8 @@ _MEASURE_UNITS = {
     **dict.fromkeys(("way", "decided_way"), "m"),
     **dict.fromkeys(("grasp_rotation", "turn", "decided_turn"), "rad"),
     **dict.fromkeys(("opened_seconds", "pull_seconds", "decided_seconds"), "s"),
-    "jitter": "rad/s, m/s",
+    "jitter": "m/s, rad/s",
+    "limit_violation": "in the unit of the limit",
     "peak_force": "N",
     "reversals": "1/s",
 }
@@ -551,4 +552,4 @@ def _format_measure(value: Any, unit: str) -> str:
         return ", ".join(filter(None, value)) or "-"
     if isinstance(value, (list, dict)):
         return f"{len(value)}, see --json"
-    return "-" if value is None else str(value)
+    return "-" if value in (None, "") else str(value)

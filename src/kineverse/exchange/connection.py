@@ -291,17 +291,7 @@ class Connection:
 
     def ask_missed(self, view: str) -> protocol.Missed | None:
         """Ask for the commits after the present revision; None if the server does not know this state."""
-        question, limit = protocol.Since(self.client, self.who, view, *self.position), _ASK_TIMEOUT
-        while True:
-            begin = time.monotonic()
-            try:
-                answer = self._ask(question, limit)
-                break
-            except OfflineError:
-                # A question is lost with a connection that is cut; a long answer takes long on a slow one.
-                if time.monotonic() - begin < limit or limit >= LONGEST:
-                    raise
-                limit = min(2 * limit, LONGEST)
+        answer = self._ask(protocol.Since(self.client, self.who, view, *self.position), LONGEST)
         if isinstance(answer, protocol.Missed):
             return answer
         if isinstance(answer, protocol.Refused) and answer.reason == "stale":

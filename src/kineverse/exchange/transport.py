@@ -341,7 +341,8 @@ class Transport(_Owner):
         """Return the answer to a question.
 
         One that gives way lets other messages of the same connection overtake it and its answer. Raise a
-        :class:`NoAnswerError` at once if nobody is there who answers; else after the timeout [s].
+        :class:`NoAnswerError` at once if nobody is there who answers, or as soon as a connection on the way
+        is cut; else after the timeout [s]. So a question that was lost need not be asked again before.
         """
         priorities = _zenoh().Priority
         channel: Any = _zenoh().handlers.FifoChannel(_MOST_PARTS)  # a ring would lose the answer at its end

@@ -103,7 +103,9 @@ def symbol_values(
     # A constant has the same value at any values: the Jacobian of a drawer, for example.
     if unknown and not isinstance(values, State) and (names or not derived):
         more = " Values that know more than is asked for go into kv.State({...})." if derived else ""
-        raise UnknownNameError(f"Unknown symbol {unknown[0]!r}. {suggest(unknown[0], names, 'symbol')}{more}")
+        raise UnknownNameError(
+            f"Unknown symbol {unknown[0]!r:.80}. {suggest(unknown[0], names, 'symbol')}{more}"
+        )
     twice = [s for s in symbols if s in given and str(s) in given]
     if twice:
         raise duplicate_value_error(twice[0])

@@ -280,10 +280,11 @@ def _not_found_message(uri: str, name: str, inside: str, log: _SearchLog) -> str
     if log.without_file:
         places = [str(path) for path in dict.fromkeys(log.without_file)]
         return f"{quote(uri)}: package {quote(name)} has no file {quote(inside)}. It is at:{_lines(places)}"
+    places = list(dict.fromkeys(log.places))
     return (
         f"{quote(uri)}: there is no package {quote(name)}. "
-        "Set KINEVERSE_PACKAGE_PATH or ROS_PACKAGE_PATH to the folder that holds it. "
-        f"Looked in:{_lines(list(dict.fromkeys(log.places)))}"
+        "Set KINEVERSE_PACKAGE_PATH or ROS_PACKAGE_PATH to the folder that holds it."
+        + (f" Looked in:{_lines(places)}" if places else "")
     )
 
 

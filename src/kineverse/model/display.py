@@ -34,7 +34,10 @@ def format_line(value: object) -> str:
         ends = f"{value.kind} from {value.parent} to {value.child}"
         return ends + (f", {', '.join(map(str, value.coordinates))}" if value.coordinates else "")
     if isinstance(value, Body):
-        parts = [_several(len(value.visuals), "visual"), _several(len(value.collisions), "collision")]
+        parts = [
+            count_values(len(value.visuals), "visuals"),
+            count_values(len(value.collisions), "collisions"),
+        ]
         return ", ".join(parts + ([] if value.inertia is None else [f"{value.inertia.mass:g} kg"]))
     if isinstance(value, Mapping):
         return " + ".join(f"{_factor(factor)} · {speed}" for speed, factor in value.items()) or "0"
@@ -45,10 +48,6 @@ def count_values(count: int, kind: str) -> str:
     """Return a number with the noun of a kind of values: ``1 constraint``, ``2 bodies``."""
     noun = {"bodies": "body", "data": "datum"}.get(kind, kind.removesuffix("s"))
     return f"{count} {noun if count == 1 else kind}"
-
-
-def _several(count: int, what: str) -> str:
-    return f"{count} {what}{'' if count == 1 else 's'}"
 
 
 def _text(value: object) -> str:

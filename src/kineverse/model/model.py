@@ -69,7 +69,7 @@ class Model(ModelView):
     'frame handle'
     'constraint door/range'
     >>> model
-    <Model: 2 frames, 1 DoF, 1 constraints (version 1)>
+    <Model: 2 frames, 1 DoF, 1 constraint (version 1)>
     >>> model.fk("handle")({"door": 0.5})[:3, 3].round(3)
     array([0.351, 0.192, 0.   ])
     >>> model.violations({"door": 2})

@@ -283,7 +283,7 @@ class ModelView(SymbolicView):
                 why = f"has coordinates of other names: {moved}."
             raise UnknownNameError(f"The joint {path!r} {why}")
         raise UnknownNameError(
-            f"There is no symbol {name!r}. {suggest(name, map(str, coordinates), 'symbol')}"
+            f"There is no symbol {name!r:.80}. {suggest(name, map(str, coordinates), 'symbol')}"
         )
 
     def degree_of_freedom(self, name: Symbol | str) -> Symbol:

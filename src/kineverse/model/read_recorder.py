@@ -289,5 +289,5 @@ def unknown_name_error(kind: str, name: str, available: Any) -> UnknownNameError
         start, end = name[: len(name) // 2 + 1], name[-len(name) // 2 :]
         names = [n for n in names if n.startswith(start) or n.endswith(end)][:_MANY]
         if not names:
-            return UnknownNameError(f"There is no {noun} {name!r}, and none of a similar name.")
-    return UnknownNameError(f"There is no {noun} {name!r}. {suggest(name, names, noun)}")
+            return UnknownNameError(f"There is no {noun} {name!r:.80}, and none of a similar name.")
+    return UnknownNameError(f"There is no {noun} {name!r:.80}. {suggest(name, names, noun)}")

@@ -342,6 +342,9 @@ class SymbolicView:
         >>> handle({"kitchen/fridge_door": 0.5})[:3, 3].round(3)
         array([ 0.358, -0.197,  1.184])
         """
+        for name in (frame, relative_to):
+            if not isinstance(name, str):
+                raise unknown_name_error(FRAMES, name, ())
         with self._lock:
             self._settle()
             known = self._poses.get((frame, relative_to))

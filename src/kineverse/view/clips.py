@@ -115,14 +115,15 @@ def encode_clip(
     if len({image.shape for image in pictures}) != 1:
         raise ShapeError("a clip is one or more pictures of one size")
     images = [pillow.fromarray(image) for image in pictures]
-    kind = "WEBP"
-    defaults: dict[str, Any] = {"quality": _QUALITY, "method": 6}
+    defaults: dict[str, Any]
     if suffix.lower() == ".gif":
         # One palette for all pictures: what stands still keeps its colours, and need not be written again.
         some = np.concatenate(pictures[:: max(len(pictures) // 8, 1)])
         palette = pillow.fromarray(some).quantize(256, dither=pillow.Dither.NONE)
         images = [image.quantize(palette=palette, dither=pillow.Dither.NONE) for image in images]
         kind, defaults = "GIF", {"optimize": False}
+    else:
+        kind, defaults = "WEBP", {"quality": _QUALITY, "method": 6}
     file = io.BytesIO()
     timing = {"duration": round(1000 / rate), "loop": 0}
     images[0].save(file, kind, save_all=True, append_images=images[1:], **timing, **(defaults | options))

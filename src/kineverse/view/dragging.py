@@ -18,6 +18,7 @@ import numpy.typing as npt
 
 import kineverse as kv
 from kineverse._extras import install_command
+from kineverse._rich_display import Html, element
 from kineverse.errors import KineverseError
 from kineverse.lie import quaternion, rotation_angle
 from kineverse.model.frame import WORLD
@@ -26,7 +27,7 @@ from kineverse.model.projection import is_equality
 from kineverse.state import State
 from kineverse.symbols import Symbol
 
-from .html import FONT, Html, HtmlBox, element
+from .html import FONT, HtmlBox
 from .poses import to_wxyz
 from .rendering.triangle_mesh import Floats
 from .scene import ViewerScene

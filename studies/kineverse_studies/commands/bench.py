@@ -145,7 +145,7 @@ def format_benchmark(result: BenchmarkResult, targets: bool = False) -> str:
     if lengths:
         parts.append(format_table(("times as long", ""), lengths, "><"))
     if targets and (with_bars := [_target_row(c) for c in result.comparisons if c.bar is not None]):
-        parts.append(format_table(("target", "", "bar", ""), with_bars, "<>><"))
+        parts.append(format_table(("target", "measured", "bar", ""), with_bars, "<>><"))
     return "\n\n".join(parts)
 
 

@@ -85,7 +85,9 @@ def make_ablation_report(
     tables = [_thesis_table(thesis), _box_table(boxes)]
     trials = [t for own in pushes.values() for t in own]
     tables += [
-        trial_runner.make_group_table("Objects pushed shut", trials, PUSH_COLUMNS, ("skill",)),
+        trial_runner.make_group_table(
+            "Objects pushed shut (times of a control step in ms)", trials, PUSH_COLUMNS, ("skill",)
+        ),
         trial_runner.make_exception_table(trials),
         trial_runner.make_failure_table(trials),
     ]

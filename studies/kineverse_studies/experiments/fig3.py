@@ -83,7 +83,7 @@ def run(progress: Progress, options: Options) -> Report:
                 ),
             ),
             ReportTable(
-                "The lock: upper bound of the speed",
+                "The lock: upper bound of the speed of a [m/s], by the position of its bolt b",
                 ("a [m]", "b = 0", "b = 0.29", "b = 0.31", "b = 0.6", "unlocked from b ="),
                 tuple(
                     (a, *(float(bound([a, b])) for b in (0.0, 0.29, 0.31, 0.6)), steps[a]) for a in _LOCK_AT
@@ -91,7 +91,7 @@ def run(progress: Progress, options: Options) -> Report:
             ),
             ReportTable(
                 "How far the upper edge moves, shortly before the door is closed",
-                ("before closed [m]", "published: per m of a", "regular: per rad of the angle"),
+                ("before closed [m]", "published [m], per m of a", "regular [m], per rad of the angle"),
                 (
                     *zip(_BEFORE_CLOSED, slopes.tolist(), regular_slopes.tolist(), strict=True),
                     ("closed", "no bound", closed),

@@ -38,7 +38,7 @@ class Options:
             if option == "executor" and "processes" not in supported:
                 raise InvalidValueError(f"The experiment '{name}' runs in one process, without an executor.")
             if option not in supported and option != "executor":
-                takes = ", ".join(f"--{known}" for known in supported) or "none"
+                takes = ", ".join(f"--{known}" for known in supported) or "no options"
                 raise InvalidValueError(f"The experiment '{name}' takes no --{option}. It takes {takes}.")
         for option, least in (("seed", 0), ("count", 1), ("processes", 1)):
             value = getattr(self, option)

@@ -136,7 +136,7 @@ def test_without_a_figure_nothing_is_written(tmp_path, monkeypatch, capsys):
     [
         (["reproduce"], "There are: fig3"),
         (["reproduce", "fig"], "Did you mean 'fig4' or 'fig3'"),
-        (["reproduce", "fig3", "--quick"], "'fig3' takes no --quick. It takes none."),
+        (["reproduce", "fig3", "--quick"], "'fig3' takes no --quick. It takes no options."),
         (["reproduce", "fig3", "--figure", "nowhere/door.png"], "nowhere/door.png cannot be written"),
         (["reproduce", "fig3", "--figure", "door.what"], "cannot be written to 'door.what'"),
     ],

@@ -333,7 +333,7 @@ def make_joint_model(pair: RecordedPair, fit: Fit) -> Model:
     ...     recording.pair(), noise, families=["prismatic", "revolute"]
     ... )
     >>> kv.estimation.recordings.make_joint_model(recording.pair(), joint.fit)
-    <Model: 1 frames, 1 DoF, 1 constraints (version 1)>
+    <Model: 1 frame, 1 DoF, 1 constraint (version 1)>
     """
     motion, names = fit.motion, (pair.child, pair.parent, pair.child)
     if motion.rows == 6 or fit.family == CURVE:

@@ -106,7 +106,7 @@ def make_tables(results: Fig4Results) -> tuple[ReportTable, ...]:
             tuple(_reported_row(*row) for row in reported),
         ),
         ReportTable(
-            "Errors against noise, and the processor time of one prediction and update",
+            "Errors against noise [m, rad], and the processor time of one prediction and update",
             ("noise", "filter", "mean", "sd", "max", "NEES", "time [ms]", "its sd", "its median"),
             tuple(
                 (
@@ -136,7 +136,8 @@ def make_tables(results: Fig4Results) -> tuple[ReportTable, ...]:
             ),
         ),
         ReportTable(
-            f"Against degrees of freedom, at {strongest.noise}; the papers: below {protocol.REPORTED:g} ms",
+            f"Against degrees of freedom, at {strongest.noise} (errors: m, rad; the papers: below "
+            f"{protocol.REPORTED:g} ms)",
             (
                 "DoF",
                 *(f"{name}: mean error" for name in names),
@@ -152,7 +153,7 @@ def make_tables(results: Fig4Results) -> tuple[ReportTable, ...]:
             ),
         ),
         ReportTable(
-            "What the mean errors of the papers' filter depend on",
+            "What the mean errors [m, rad] of the papers' filter depend on",
             ("variant", *(str(errors.noise) for errors in results.errors)),
             tuple((name, *(format_fixed(mean, 4) for mean in row)) for name, row in results.variants.items()),
         ),

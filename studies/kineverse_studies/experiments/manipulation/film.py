@@ -113,7 +113,7 @@ def choose_cameras(views: Sequence[RowView], aspect: float) -> list[Camera]:
         product(_ELEVATIONS, azimuths),
         key=lambda direction: sum(v.score(v.camera(direction, aspect), aspect) for v in views),
     )
-    return [view.rendering.camera(best, aspect) for view in views]
+    return [view.camera(best, aspect) for view in views]
 
 
 def _place(model: Model, items: Sequence[Drawable], values: Mapping[str, float]) -> TriangleSoup:

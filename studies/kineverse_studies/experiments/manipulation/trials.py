@@ -212,13 +212,13 @@ TIMES = (
     Column("wall_mean_ms", "wall mean", lambda trials: step_times(trials).wall),
 )
 QUALITY = (
-    Column("limit_violation", "limits violated", worst("limit_violation")),
+    Column("limit_violation", "limits violated [own unit]", worst("limit_violation")),
     Column("grasp_error_mm", "grasp error [mm]", worst("grasp_error", 1e3)),
     Column("contact_losses", "contact losses", worst("contact_losses"), 6),
     Column("penetration_mm", "penetration [mm]", worst("penetration", 1e3)),
     Column("penetrating", "deepest pair", _deepest_pair),
     Column("pressed_mm", "pressed [mm]", worst("pressed", 1e3)),
-    Column("jitter", "jitter", worst("jitter")),
+    Column("jitter", "jitter [m/s, rad/s]", worst("jitter")),
     Column("peak_force", "force [N]", worst("peak_force")),
 )
 """Largest values of single trials; penetration is that of the pairs that are not excepted."""

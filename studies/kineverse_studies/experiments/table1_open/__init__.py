@@ -158,7 +158,7 @@ PROGRAM_COLUMNS = (
         "grasp error [mm]",
         lambda trials: worst("grasp_error", 1e3)([t for t in trials if t.done]),
     ),
-    Column("limit_violation", "limits violated", worst("limit_violation")),
+    Column("limit_violation", "limits violated [own unit]", worst("limit_violation")),
 )
 """Columns of the programs alone; the grasp error is that of the runs that opened the object."""
 
