@@ -228,9 +228,15 @@ def locks() -> np.ndarray:
 
 
 def distances() -> np.ndarray:
+    """Return the fridge ajar, with the way from its handle to what the example measures its distance to."""
     found = run_example("12_collision_distances")
-    eye = Camera((-1.2, -1.9, 1.6), (0.9, -1.25, 0.95), field_of_view=0.5)
-    return picture(found["model"], {"kitchen/fridge_door": 0.3}, SIZE, eye, near=0.25)
+    scene, state = found["scene"], found["state"].updated({"kitchen/fridge_door": 0.7})
+    scene.update(state)
+    pair = scene.distance("kitchen/fridge_door_handle", "kitchen/sink_area")
+    ends = np.array([pair.point_a, pair.point_b])
+    way = [Drawable("world", piece, TRACE, "visual") for piece in build_arrow(ends, 0.4)]
+    eye = Camera((-2.0, -1.6, 2.0), (0.6, -1.1, 0.95), field_of_view=0.36)
+    return picture(found["model"], state, SIZE, eye, over=way)
 
 
 def identify_a_joint() -> np.ndarray:
