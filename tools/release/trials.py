@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import shlex
 import signal
 import subprocess
 import sys
@@ -12,7 +13,6 @@ import tempfile
 import urllib.request
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from types import MappingProxyType
 
@@ -193,8 +193,7 @@ def _run_documented(environment: Environment) -> None:
     lines = [line for block in blocks for line in re.findall(r"^\$ kineverse (.*)$", block, re.MULTILINE)]
     assert lines, "docs/command_line.md has no commands"
     for line in lines:
-        words = partial(re.sub, r'"(\w+) (\w+)"', r"\1 \2")(re.split(r"\s+#\s", line)[0])
-        done = environment.command(words, status=(0, 1, 2))
+        done = environment.run("kineverse", *shlex.split(line, comments=True), status=(0, 1, 2))
         told = f"kineverse {line} does not say what to install:\n{done.stderr}"
         assert done.returncode < 2 or (done.stderr.count("\n") == 1 and "pip install " in done.stderr), told
 
