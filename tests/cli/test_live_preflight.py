@@ -82,7 +82,7 @@ def _make_screen(monkeypatch, height: int):
         for name in ("serve", "world")
     }
     supervisor = SimpleNamespace(children=children, reader=SimpleNamespace(age={}), is_online=True)
-    monkeypatch.setattr(shutil, "get_terminal_size", lambda: os.terminal_size((80, height)))
+    monkeypatch.setattr(shutil, "get_terminal_size", lambda *_, **__: os.terminal_size((80, height)))
     monkeypatch.setattr(live_status, "describe_all", lambda _: [f"line {k}" for k in range(30)])
     out = _Terminal()
     screen = live_system.Screen(SimpleNamespace(name="home", supervisor=supervisor), out)
