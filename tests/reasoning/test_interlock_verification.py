@@ -89,7 +89,7 @@ def test_ranges() -> None:
     assert reasoning.contradictions(subject, Interlocks([kept(0, B + 0.5), nothing]))
 
 
-EXAMPLES = re.compile(r"^ *Examples\n *-{8}\n.*?(?=^ *\"\"\")", re.MULTILINE | re.DOTALL)
+EXAMPLES = re.compile(r"^ *(Examples|See Also)\n *-{8}\n.*?(?=^ *\"\"\")", re.MULTILINE | re.DOTALL)
 
 
 def test_checker_is_short_and_independent() -> None:
