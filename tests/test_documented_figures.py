@@ -36,6 +36,8 @@ STATED = {
     "files.md: ",  # exit statuses
     "identification.md: family",  # numbers of joint values, and prior probabilities
     "conventions.md: ",
+    "README.md: work",  # some of those of benchmarks.md, as test_readme holds
+    "release.md: extra",  # versions of Python, by tools/dependencies.py, which asks the package index
 }
 """Tables of numbers that nobody measured: page, and title of the first column."""
 

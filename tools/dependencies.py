@@ -109,7 +109,14 @@ def ask(*words: str, said: str | None = None) -> subprocess.CompletedProcess[str
     if certificates := _pip("cert"):
         environment.setdefault("SSL_CERT_FILE", certificates)
     return subprocess.run(
-        command, input=said, capture_output=True, text=True, check=False, cwd=ROOT, env=environment
+        command,
+        input=said,
+        capture_output=True,
+        text=True,
+        encoding="utf-8",
+        check=False,
+        cwd=ROOT,
+        env=environment,
     )
 
 
@@ -141,7 +148,7 @@ def _index() -> list[str]:
 def _pip(setting: str) -> str:
     """Return a setting of pip, from its variables or else its files; "" if there is none."""
     command = [sys.executable, "-m", "pip", "config", "list"]
-    listed = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    listed = subprocess.run(command, capture_output=True, text=True, encoding="utf-8", check=True).stdout
     found = dict(line.split("=", 1) for line in listed.splitlines() if "=" in line)
     values = (found.get(f"{source}.{setting}", "") for source in (":env:", "global", "user", "site"))
     return next((value.strip("'\"") for value in values if value.strip("'\"")), "")

@@ -258,7 +258,13 @@ def velocity(path: str) -> Symbol:
 
 
 def acceleration(path: str) -> Symbol:
-    """Return the acceleration symbol of a degree of freedom."""
+    """Return the acceleration symbol of a degree of freedom.
+
+    Examples
+    --------
+    >>> kv.acceleration("door") == kv.velocity("door").derivative()
+    True
+    """
     return Symbol(path, 2)
 
 

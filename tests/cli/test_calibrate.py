@@ -250,7 +250,7 @@ def wrong(arm, tmp_path, **change):
         ((*SEEN, "--attach", "camera=world"), "Nothing is free"),
         (("--free", "nonsense", *SEEN), "Nothing is free|'nonsense' does not say"),
         (("--free", "offset", *SEEN), "says nothing of where"),
-        (("--free", "offsets elbow", *SEEN), "named 'elbow'.*roll"),
+        (("--free", "offsets elbow", *SEEN), "joint 'elbow'.*roll"),
         (("--free", "mount camra", "--attach", "camera=world", *SEEN), "'camra'.*'camera'"),
         (("--free", "offsets *"), "does not say which frame was seen.*--observed"),
         (("--free", "offsets *", "--observed", "tp"), "'tp' is no frame of the model.*'tip'"),

@@ -137,7 +137,7 @@ def test_what_keeps_a_robot_from_beginning_is_one_error(run, outside, why):
     class Blind(Outside):
         def __init__(self, *arguments, **options):
             super().__init__(*arguments, **options)
-            self.blind, self.remarks = True, ("Nobody serves the poses /poses/front.",)
+            self.blind, self.remarks = True, ("Nobody publishes the poses /poses/front.",)
 
     class Elsewhere(Outside):
         def __init__(self, *arguments, **options):
@@ -147,7 +147,7 @@ def test_what_keeps_a_robot_from_beginning_is_one_error(run, outside, why):
         raise OfflineError("'arm' has not reported for 6 s.")
 
     message = {
-        "blind": "'flap' has not been seen for 0.2 s. Nobody serves the poses /poses/front.",
+        "blind": "'flap' has not been seen for 0.2 s. Nobody publishes the poses /poses/front.",
         "nobody observes it": "Nobody observes 'flap'. [observed] in the settings of the robot is to name",
         "offline": "'arm' has not reported for 6 s.",
         "not installed": "--world ros is brought by kineverse_ros, which is not installed",

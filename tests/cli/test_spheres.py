@@ -83,7 +83,7 @@ def test_the_cache_is_listed_and_emptied(run):
     ("words", "part"),
     [
         (["robot.urdf", "--links", "bse"], "'base'"),
-        (["robot.urdf", "--links", "bare"], "has shapes"),
+        (["robot.urdf", "--links", "bare"], "no link with shapes"),
         (["bare.urdf"], "no shapes"),
         (["robot.urdf", "--protrusion", "-1mm"], "positive"),
         (["robot.urdf", "--protrusion", "5deg"], "length"),

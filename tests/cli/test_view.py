@@ -48,7 +48,9 @@ def test_the_page_has_the_name_of_the_robot_in_the_file(run, shown, tmp_path, mo
     monkeypatch.setattr(
         server,
         "start",
-        lambda port, label, host, start=server.start: labels.append(label) or start(port, label, host),
+        lambda port, label, host, start=server.start, **options: (
+            labels.append(label) or start(port, label, host, **options)
+        ),
     )
     (tmp_path / "robot.urdf").write_text(URDF)
     status, out, _ = run("view", tmp_path / "robot.urdf", "--port", "0", "--no-browser", "--degrees")
@@ -63,7 +65,7 @@ def test_with_a_host_the_address_has_a_token(run, shown, tmp_path, monkeypatch):
 
     # Tests stay on this computer.
     monkeypatch.setattr(
-        AccessControl, "from_host", staticmethod(lambda host: AccessControl("127.0.0.1", f"for-{host}"))
+        AccessControl, "from_host", staticmethod(lambda host, **_: AccessControl("127.0.0.1", f"for-{host}"))
     )
     monkeypatch.setattr("kineverse.view.server.find_free_port", lambda host, port: port)
     (tmp_path / "robot.urdf").write_text(URDF)

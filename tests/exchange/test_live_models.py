@@ -71,7 +71,7 @@ def test_a_live_model_answers_like_any_model(server: Server, load: Callable[...,
     assert live.constraints_for(live.degrees_of_freedom).keys() == model.constraints.keys()
     assert live.default_state() == model.default_state()
     assert vars(LiveModel).keys() & {name for kind in kv.Model.__mro__[:-1] for name in vars(kind)} == {
-        *("__doc__", "__init__", "__module__", "_deliver", "adopt", "edit")
+        *("__doc__", "__init__", "__module__", "_deliver", "_repr_html_", "adopt", "edit")
     }
 
 

@@ -67,9 +67,9 @@ def test_a_client_gets_the_files_of_meshes_by_their_digests(
                 assert found is not None
                 assert found.read_bytes() == STL
             assert mesh_of(model, "lid").content is None
-    kept = [path for path in cache.rglob("*") if path.name == hashlib.sha256(STL).hexdigest()]
-    assert [path.read_bytes() for path in kept] == [STL]
-    assert not any(path.read_bytes() == STL + b"\n" for path in cache.rglob("*") if path.is_file())
+    kept = [path.read_bytes() for path in cache.rglob("*") if path.stem == hashlib.sha256(STL).hexdigest()]
+    assert [STL in content for content in kept] == [True]
+    assert not any(STL + b"\n" in path.read_bytes() for path in cache.rglob("*") if path.is_file())
 
 
 def test_a_file_that_has_changed_is_not_sent(

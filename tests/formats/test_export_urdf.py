@@ -234,7 +234,7 @@ def test_error_names_all_unsupported_features(tmp_path: Path) -> None:
         assert part in message
     assert ".kv.json" in message
     assert "leave_out" in message
-    with pytest.raises(kv.errors.UnknownNameError, match=r"'lok' cannot be left out.*Did you mean 'lock'"):
+    with pytest.raises(kv.errors.UnknownNameError, match=r"'lok'.*Did you mean 'lock'"):
         model.save(tmp_path / "m.urdf", leave_out=["lok"])
     assert not list(tmp_path.iterdir())
 

@@ -386,7 +386,7 @@ def test_a_parameter_has_no_other_value_at_the_start(value):
         ({"a": 2}, {}, InvalidValueError, "beyond its limits"),
         ({"a": float("nan")}, {}, InvalidValueError, "finite number"),
         ({"a": 1}, {"budget": 0}, InvalidValueError, "positive time"),
-        ({"a": 1}, {"fixed": ["z"]}, UnknownNameError, "'z' is no degree of freedom"),
+        ({"a": 1}, {"fixed": ["z"]}, UnknownNameError, "no symbol 'z'"),
         ({"a": 1}, {"state": {"z": 1}}, UnknownNameError, "z"),
     ],
 )

@@ -44,7 +44,7 @@ def test_observed_poses_move_the_model():
         if one.child_frame_id == HINGE
     }
     assert stamp <= bench.ros.nanoseconds - SECOND // 50
-    assert not [text for text in bench.warnings if "Nobody serves" not in text]
+    assert not [text for text in bench.warnings if "Nobody publishes" not in text]
 
 
 def test_frames_of_tf_are_observed_by_way_of_frames_that_are_not_in_the_model():
@@ -88,7 +88,7 @@ def test_bad_poses_move_nothing_and_are_named_once_a_second(frame_id, scale, ago
         bench.see("door_pose", frame_id, scale * pose_of(bench.model, HINGE, revolute__door=0.8), ago=ago)
         bench.ros.advance(0.02)
     assert value_of(bench, HINGE) == 0.0
-    said = [text for text in bench.warnings if "Nobody serves" not in text]
+    said = [text for text in bench.warnings if "Nobody publishes" not in text]
     assert 1 <= len(said) <= 2
     assert all(complaint in text for text in said)
 

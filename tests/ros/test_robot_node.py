@@ -268,8 +268,8 @@ def test_what_is_missing_is_said():
     for part in (
         "No position of lift, pan has come on /joint_states.",
         "TF has no way from 'odom' to 'base_link'.",
-        "Nobody serves /joint_states",
-        "Nobody serves the poses /poses/door.",
+        "Nobody publishes /joint_states",
+        "Nobody publishes the poses /poses/door.",
     ):
         assert part in told
 

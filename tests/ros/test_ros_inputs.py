@@ -117,7 +117,7 @@ def test_topics_tell_sources_apart_and_name_what_nobody_serves():
     assert heard == ["/joint_states of /driver", "/joint_states of /driver #2"]
     assert sorted(said) == [
         "/door has geometry_msgs/msg/PoseStamped here, and messages of another type by /driver (std_msgs/msg/String).",
-        "Nobody serves /nobody (geometry_msgs/msg/PoseStamped).",
+        "Nobody publishes /nobody (geometry_msgs/msg/PoseStamped).",
     ]
     assert ros.Time() == Time()
 

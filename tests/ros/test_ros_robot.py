@@ -328,7 +328,7 @@ def test_paths_of_other_things_and_from_elsewhere_are_refused(started):
 
 class Complaining(Far):
     def begin(self) -> None:
-        self.link.send(Note("Nobody serves /joint_states."))
+        self.link.send(Note("Nobody publishes /joint_states."))
         super().begin()
 
 
@@ -340,7 +340,7 @@ class Broken(Far):
 @pytest.mark.parametrize(
     ("kind", "match"),
     [
-        (Complaining, "'bot' has not reported for 0.1 s. Nobody serves /joint_states."),
+        (Complaining, "'bot' has not reported for 0.1 s. Nobody publishes /joint_states."),
         (Broken, "cannot be imported"),
     ],
 )

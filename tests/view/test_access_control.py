@@ -178,7 +178,9 @@ def test_a_running_server_answers_its_own_page_only():
 
 
 def test_a_network_server_requires_its_token(monkeypatch):
-    monkeypatch.setattr(AccessControl, "from_host", staticmethod(lambda host: AccessControl(host, "s3cret")))
+    monkeypatch.setattr(
+        AccessControl, "from_host", staticmethod(lambda host, **_: AccessControl(host, "s3cret"))
+    )
     server = web.start(0, "shared")
     try:
         port = server.get_port()

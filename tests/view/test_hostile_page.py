@@ -117,7 +117,9 @@ def test_html_in_names_is_shown_as_text(browser, hostile):
 
 
 def test_only_the_own_page_of_a_browser_reaches_the_viewer(browser, monkeypatch):
-    monkeypatch.setattr(AccessControl, "from_host", staticmethod(lambda host: AccessControl(host, "s3cret")))
+    monkeypatch.setattr(
+        AccessControl, "from_host", staticmethod(lambda host, **_: AccessControl(host, "s3cret"))
+    )
     attempt = """([address, protocol]) => new Promise(done => {
       const socket = new WebSocket(address, protocol)
       socket.onmessage = () => done('read')

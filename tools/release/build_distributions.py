@@ -124,7 +124,9 @@ def _build(kind: str, source: Path, into: Path) -> Path:
 
 
 def _run(command: list[str]) -> None:
-    subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=True)
+    subprocess.run(
+        command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, encoding="utf-8", check=True
+    )
 
 
 def _git(root: Path, *words: str) -> str:

@@ -48,6 +48,7 @@ class Environment:
             env=variables,
             capture_output=True,
             text=True,
+            encoding="utf-8",
             check=False,
         )
         told = f"{' '.join(words)} ends with status {done.returncode}:\n{done.stdout}{done.stderr}"
@@ -101,7 +102,9 @@ def try_core(environment: Environment) -> None:
 def try_view(environment: Environment) -> None:
     """Fetch the page of a model, and end it as Ctrl-C does."""
     words = [environment.folder / "bin" / "kineverse", "view", "kitchen", "--no-browser"]
-    with subprocess.Popen(words, env=environment.variables, stdout=subprocess.PIPE, text=True) as page:
+    with subprocess.Popen(
+        words, env=environment.variables, stdout=subprocess.PIPE, text=True, encoding="utf-8"
+    ) as page:
         try:
             assert page.stdout is not None
             said = page.stdout.readline()
@@ -167,7 +170,9 @@ def try_out(name: str, archives: list[Archives], scratch: Path) -> None:
     subprocess.run([sys.executable, "-m", "venv", str(folder)], check=True)
     wheels = [f"{first.wheel}{trial.extras}", *(str(a.wheel) for a in archives[1:] if trial.others)]
     install = [str(folder / "bin" / "python"), "-m", "pip", "install", "--quiet", *wheels]
-    subprocess.run(install, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=True)
+    subprocess.run(
+        install, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, encoding="utf-8", check=True
+    )
     print(f"try     {name}", flush=True)
     with tempfile.TemporaryDirectory(prefix="kv-") as runtime:  # a socket has a short path
         # As on the first day: no cache, no settings, no packages from elsewhere.

@@ -269,7 +269,7 @@ class Topics:
                 text = f"{name} has {kind} here, and messages of another type by {list_some(others, 3)}."
                 self._complaints.add_once(text)
             elif waited >= PATIENCE:
-                self._complaints.add_once(f"Nobody serves {name} ({kind}).")
+                self._complaints.add_once(f"Nobody publishes {name} ({kind}).")
 
     def _count(self, source: str, info: Any) -> None:
         self.received[source] += 1

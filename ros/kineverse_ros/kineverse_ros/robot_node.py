@@ -293,7 +293,7 @@ class RobotNode:
         ]
         if topics:
             names = [self._node.resolve_topic_name(topic) for topic in topics]
-            self._complaints.add_once(f"Nobody serves the poses {list_some(names, 3)}.")
+            self._complaints.add_once(f"Nobody publishes the poses {list_some(names, 3)}.")
 
     # -- what the skill commands -----------------------------------------------------------------------------
 

@@ -358,16 +358,16 @@ def _parse_arguments(words: Sequence[str]) -> argparse.Namespace:
 
 
 class _UsageError(Exception):
-    def __init__(self, parser: argparse.ArgumentParser, message: str) -> None:
-        super().__init__(message)
-        self.parser = parser
+    parser: argparse.ArgumentParser
 
 
 class _Parser(argparse.ArgumentParser):
     """Parser that raises an error of usage, in place of printing it at once."""
 
     def error(self, message: str) -> NoReturn:
-        raise _UsageError(self, message)
+        error = _UsageError(message)
+        error.parser = self
+        raise error
 
 
 def _unknown_option_error(parser: argparse.ArgumentParser, word: str) -> UnknownNameError:

@@ -106,7 +106,7 @@ class SdfBodyWriter:
     def _material(self, element: Tag, shape: Shape, name: str) -> None:
         if element.name == "collision":
             if shape.color is not None or shape.texture:
-                self._remark(f"the colours of what is to be touched of '{name}' are left out")
+                self._remark(f"the colours of the collision shapes of '{name}' are left out")
             return
         if shape.texture:
             self._remark(f"the texture {shape.texture} is left out: SDF has textures for materials of meshes")

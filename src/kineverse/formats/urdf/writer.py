@@ -87,7 +87,7 @@ class UrdfBodyWriter:
         for shape in body.collisions:
             self._shape(link, "collision", shape, name)
             if shape.color is not None or shape.texture:
-                self._remark(f"the colours of what is to be touched of '{name}' are left out")
+                self._remark(f"the colours of the collision shapes of '{name}' are left out")
 
     def _shape(self, link: Tag, tag: str, shape: Shape, name: str) -> Tag | None:
         if isinstance(shape.geometry, (Ellipsoid, Cone)):
