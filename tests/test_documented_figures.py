@@ -41,6 +41,9 @@ STATED = {
 }
 """Tables of numbers that nobody measured: page, and title of the first column."""
 
+SLOW = {"stream-monitoring", "costs"}
+"""Tables whose short form takes more than 5 s of a quiet machine."""
+
 
 def _name(one):
     return one.name
@@ -49,7 +52,11 @@ def _name(one):
 @pytest.mark.parametrize(
     "one",
     [
-        pytest.param(one, marks=pytest.mark.data if one.data else (), id=_name(one))
+        pytest.param(
+            one,
+            marks=pytest.mark.data if one.data else pytest.mark.long if one.name in SLOW else (),
+            id=_name(one),
+        )
         for one in DOCUMENTED
         if one.short
     ],

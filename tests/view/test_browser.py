@@ -224,6 +224,7 @@ def corners(viewer, camera):
     return seen[:, :2] / seen[:, 2:] / half
 
 
+@pytest.mark.long
 def test_the_camera_frames_the_model_in_any_window_until_it_is_moved(browser):
     with view(cabinet(), port=0) as viewer:
         page = browser.new_page(viewport={"width": 900, "height": 420})

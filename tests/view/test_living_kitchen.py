@@ -172,10 +172,8 @@ def test_uncertainty_paths_pass_the_tracked_positions_and_have_their_lengths(che
 # -- identification --------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    "name",
-    ["crate", *(pytest.param(name, marks=pytest.mark.long) for name in ("chest", "stool"))],
-)
+@pytest.mark.long
+@pytest.mark.parametrize("name", ["crate", "chest", "stool"])
 def test_an_unknown_mechanism_is_identified_and_then_tracked(name):
     simulation, off = simulate_mechanism(10.0, mechanism=name)
     mechanism, learner = simulation.mechanism, simulation.learner

@@ -13,7 +13,8 @@ from kineverse.estimation.identification.solver import solver
 @pytest.mark.parametrize(
     ("family", "count"),
     [
-        ("revolute", 48),
+        ("revolute", 18),
+        pytest.param("revolute", 48, marks=pytest.mark.long),
         ("prismatic", 18),
         ("planar", 12),
         *(pytest.param(family, 48, marks=pytest.mark.long) for family in ("prismatic", "planar")),
