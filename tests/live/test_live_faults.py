@@ -13,7 +13,8 @@ BUSY = 20.0
 
 
 @pytest.mark.compiler
-def test_what_is_killed_or_frozen_stops_the_robot_which_finishes_later():
+@pytest.mark.parametrize("number", [0, pytest.param(1, marks=pytest.mark.long)])
+def test_what_is_killed_or_frozen_stops_the_robot_which_finishes_later(number):
     model = kv.Model()
     with model.edit() as edit:
         edit.include("shelf_drawers")
@@ -23,6 +24,6 @@ def test_what_is_killed_or_frozen_stops_the_robot_which_finishes_later():
     setting = faults.Setting(
         model, "shelf_drawers/upper_drawer", "shelf_drawers/upper_drawer_handle", world="kinematic"
     )
-    found = faults.try_faults(setting, faults.FAULTS[:2], BUSY)
-    assert len(found) == 2
+    found = faults.try_faults(setting, faults.FAULTS[number : number + 1], BUSY)
+    assert len(found) == 1
     assert found[0]["way"] < 0.1
