@@ -89,12 +89,12 @@ def test_ranges() -> None:
     assert reasoning.contradictions(subject, Interlocks([kept(0, B + 0.5), nothing]))
 
 
-EXAMPLES = re.compile(r"^ *(Examples|See Also)\n *-{8}\n.*?(?=^ *\"\"\")", re.MULTILINE | re.DOTALL)
+EXAMPLES = re.compile(r"\n\n *Examples\n *-{8}\n.*?(?=\"\"\")", re.DOTALL)
 
 
 def test_checker_is_short_and_independent() -> None:
     text = EXAMPLES.sub("", Path(interlock_verification.__file__).read_text(encoding="utf-8"))
-    assert len([line for line in text.splitlines() if line.strip()]) <= 100
+    assert len([line for line in text.splitlines() if line.strip()]) < 100
     own = {line.split()[1] for line in text.splitlines() if line.startswith("from .")}
     assert own == {".boxes", ".constraint_evaluation", ".interlock_records"}
 
